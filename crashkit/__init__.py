@@ -1,0 +1,40 @@
+"""crashkit: crash runs in, one labelled dataset, a mesh hierarchy and trustworthy surrogates out.
+
+The functions below are what the commands of the same name call; they are imported when first used, so that
+`import crashkit` stays quick.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+__version__ = "0.1.0"
+
+# Public name -> "module:attribute".
+_LAZY = {
+    "ingest": "crashkit.ingest:ingest",
+    "open_dataset": "crashkit.dataset:open_dataset",
+    "open_hierarchy": "crashkit.dataset:open_hierarchy",
+    "validate": "data_schema:validate",
+    "coarsen": "crashkit.cli.coarsen:coarsen",
+    "train": "crashkit.cli.train:train",
+    "load_model": "crashkit.cli.predict:load_model",
+    "predict": "crashkit.cli.predict:predict",
+    "evaluate": "crashkit.cli.evaluate:evaluate",
+    "write_paraview": "crashkit.paraview:write_paraview",
+    "CrashkitError": "crashkit.errors:CrashkitError",
+}
+
+__all__ = ["__version__", *_LAZY]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LAZY:
+        raise AttributeError(f"module 'crashkit' has no attribute {name!r}")
+    module, attribute = _LAZY[name].split(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,1 @@
+"""Meshes through VTK: surface, quadric selection, probe maps, hierarchy."""

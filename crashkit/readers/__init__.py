@@ -1,0 +1,59 @@
+"""Source formats, behind one registry that knows no format by name.
+
+A format registers itself at the foot of its file. Other packages add theirs with an entry point in the group
+`crashkit.readers` that names a Reader object or a class without arguments.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from importlib.metadata import entry_points
+from pathlib import Path
+
+from crashkit.errors import CrashkitError, ReadError
+from crashkit.readers.base import Reader
+
+ENTRY_POINT_GROUP = "crashkit.readers"
+_READERS: dict[str, Reader] = {}
+_loaded = False
+
+
+def register(reader: Reader) -> None:
+    """Make a reader known under its name; a later one replaces an earlier one of the same name."""
+    _READERS[reader.name] = reader
+
+
+def readers() -> dict[str, Reader]:
+    """All known readers by name: this folder's, then those of other packages."""
+    global _loaded
+    if not _loaded:
+        for module in pkgutil.iter_modules(__path__):
+            if module.name != "base" and not module.name.startswith("_"):
+                importlib.import_module(f"{__name__}.{module.name}")
+        for entry in entry_points(group=ENTRY_POINT_GROUP):
+            found = entry.load()
+            register(found() if isinstance(found, type) else found)
+        _loaded = True
+    return dict(_READERS)
+
+
+def reader_for(path: Path, name: str | None = None) -> Reader:
+    """The reader called `name`, or the one that recognises the content of `path`.
+
+    Raises CrashkitError for an unknown name, ReadError where the path does not exist or nobody knows it.
+    """
+    known = readers()
+    if name is not None:
+        if name not in known:
+            raise CrashkitError(f"reader {name!r} is not known; known are {', '.join(sorted(known))}")
+        return known[name]
+    if not path.exists():
+        raise ReadError(f"{path}: no such file or folder")
+    for reader in known.values():
+        if reader.sniff(path):
+            return reader
+    raise ReadError(
+        f"{path}: the content is none of the known formats ({', '.join(sorted(known))}); "
+        "check the path, or name the format with --reader"
+    )

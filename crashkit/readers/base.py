@@ -1,0 +1,145 @@
+"""What every reader yields: a `Run`, in the solver's own units, read in bounded pieces.
+
+A reader is one file in this folder with a class that has `name`, `sniff`, `runs` and ends with
+`register(...)`. Readers write nothing and convert nothing: units, alignment, part selection and the dataset's
+layout belong to `crashkit.ingest`, so that they are the same for every format.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Part:
+    """One part of the solver's model. `rigid_wall` parts are drawn by solvers but are no structure."""
+
+    id: int
+    name: str
+    rigid_wall: bool = False
+
+
+@dataclass(frozen=True)
+class RunMesh:
+    """The mesh of one run as its solver wrote it, everything included.
+
+    position   (node, 3) float64, solver's length unit: the undeformed configuration
+    node_id    (node,) int64
+    face_nodes (face, 3 or 4) int32, 0-based, -1 in the last corner of a triangle: shells only; the outer skin
+               of solids is found by ingest
+    face_part  (face,) int32 index into `parts`
+    face_id    (face,) int64 element number
+    cell_nodes (cell, corner) int32, padded with -1: solids and beams; cell_type (cell,) uint8 VTK cell type
+    cell_part, cell_id as for faces
+    """
+
+    position: NDArray[np.float64]
+    node_id: NDArray[np.int64]
+    face_nodes: NDArray[np.int32]
+    face_part: NDArray[np.int32]
+    face_id: NDArray[np.int64]
+    parts: tuple[Part, ...]
+    cell_nodes: NDArray[np.int32] = field(default_factory=lambda: np.empty((0, 0), np.int32))
+    cell_type: NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, np.uint8))
+    cell_part: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
+    cell_id: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+
+
+@dataclass(frozen=True)
+class FieldInfo:
+    """A further result field a run offers.
+
+    `quantity` names what it measures for the change to SI ("velocity", "stress", "one", ... as in
+    `data_schema.units`); `components` is 1 for a scalar.
+    """
+
+    name: str
+    location: Literal["node", "face", "cell"]
+    components: int = 1
+    quantity: str = "one"
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A design parameter as its source states it; `unit` may be empty."""
+
+    value: float
+    unit: str = ""
+
+
+class Run(ABC):
+    """One solver run, opened lazily. Everything is in the units of its source.
+
+    name        unique in its source: folder or file name, or the number in the file
+    solver      "LS-DYNA", "OpenRadioss", ... as far as known
+    files       every file the run is read from, for checksums
+    time        (state,) float64
+    mesh        RunMesh
+    parameters  known from the source itself, often empty
+    fields      what `field` can give, by name
+    units       unit system if the source states one ("SI"), else None: the user must say
+    end_time    the end time the control data asks for, None where the source does not say
+    problems    reasons why the run is incomplete or damaged though it can be opened; ingest refuses such runs
+    """
+
+    name: str
+    solver: str
+    files: tuple[Path, ...]
+    time: NDArray[np.float64]
+    mesh: RunMesh
+    parameters: Mapping[str, Parameter]
+    fields: Mapping[str, FieldInfo]
+    units: str | None = None
+    end_time: float | None = None
+    problems: tuple[str, ...] = ()
+
+    @abstractmethod
+    def displacement(self, first: int, last: int) -> NDArray[np.float32]:
+        """Displacements (state, node, 3) of the states first <= state < last, from `mesh.position`."""
+
+    def field(self, name: str, first: int, last: int) -> NDArray[np.float32]:
+        """Field `name` (state, node | face | cell [, component]) of the states first <= state < last."""
+        raise KeyError(name)
+
+    def alive(self, first: int, last: int) -> NDArray[np.bool_] | None:
+        """(state, face) whether each shell still exists; None where nothing in this run can erode."""
+        return None
+
+    def alive_cells(self, first: int, last: int) -> NDArray[np.bool_] | None:
+        """(state, cell) the same for solids and beams."""
+        return None
+
+    def close(self) -> None:  # noqa: B027 - most readers hold nothing open
+        """Let go of files."""
+
+
+class Reader(Protocol):
+    """One source format."""
+
+    name: str
+    description: str
+
+    def sniff(self, path: Path) -> bool:
+        """Whether the content of `path` (a file, or a folder holding one run or several) is this format.
+
+        Looks at magic bytes or structure, never only at the suffix; never raises; never reads much.
+        """
+
+    def runs(self, path: Path, **options: object) -> Iterator[Run]:
+        """The runs in `path`, opened one after the other.
+
+        Raises crashkit.errors.ReadError, naming the file and the place in it.
+        """
+
+
+def split_states(count: int, nodes: int, budget: int = 64 << 20) -> Sequence[tuple[int, int]]:
+    """Ranges of states whose float32 xyz values stay below `budget` bytes each (at least one state)."""
+    step = max(1, budget // max(1, nodes * 12))
+    return [(k, min(k + step, count)) for k in range(0, count, step)]

@@ -1,0 +1,35 @@
+"""What a crash dataset is.
+
+Read `layout.py` to know every dimension, variable, unit and attribute; `validation.py` holds the rules a
+dataset must pass; `units.py` the unit systems crash solvers are run in. Nothing here reads or writes files.
+"""
+
+from data_schema.layout import (
+    ATTRIBUTES,
+    CONVENTIONS,
+    DIMENSIONS,
+    VARIABLES,
+    Attribute,
+    Variable,
+    fields,
+    parameters,
+)
+from data_schema.units import UnitSystem, UnknownUnits, to_si, unit_system
+from data_schema.validation import Violation, validate
+
+__all__ = [
+    "ATTRIBUTES",
+    "CONVENTIONS",
+    "DIMENSIONS",
+    "VARIABLES",
+    "Attribute",
+    "UnitSystem",
+    "UnknownUnits",
+    "Variable",
+    "Violation",
+    "fields",
+    "parameters",
+    "to_si",
+    "unit_system",
+    "validate",
+]

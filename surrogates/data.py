@@ -1,0 +1,57 @@
+"""What a surrogate is trained on: parameters, times, displacements by level, and the graphs between levels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+
+@dataclass(frozen=True)
+class GraphLevel:
+    """One coarse level as arrays; the fields mean what `crashkit.mesh.levels.Level` says.
+
+    Level 0 is the full mesh, level 1 the finest coarse level, higher is coarser.
+    """
+
+    index: int
+    kept: NDArray[np.int64]
+    faces: NDArray[np.int32]
+    edges: NDArray[np.int32]
+    in_finer: NDArray[np.int64]
+    to_finer: sparse.csr_matrix
+    to_full: sparse.csr_matrix
+
+    @property
+    def n_nodes(self) -> int:
+        return len(self.kept)
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """The runs a surrogate may see, and nothing of the test runs.
+
+    parameters      (sim, parameter) float64, in the units of `parameter_units`
+    time            (state,) float64, s
+    displacement    level index -> (sim, state, node of that level, 3) float32, m. Called with 0 for the full mesh
+                    only by models that work there (POD baselines, AENN, GAENN); the cascade asks for its levels.
+    full_edges      (e, 2) graph edges of level 0, for models that convolve there
+    levels          coarse levels, level 1 first; may be empty for POD baselines
+    runs            names of the runs, for messages and the model card
+    checksum        SHA-256 that identifies the dataset
+    """
+
+    parameters: NDArray[np.float64]
+    parameter_names: tuple[str, ...]
+    parameter_units: tuple[str, ...]
+    time: NDArray[np.float64]
+    displacement: Callable[[int], NDArray[np.float32]]
+    n_nodes: int
+    levels: tuple[GraphLevel, ...] = ()
+    full_edges: NDArray[np.int32] | None = None
+    runs: tuple[str, ...] = ()
+    checksum: str = ""
+    attributes: Mapping[str, str] | None = None
