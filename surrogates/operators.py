@@ -1,0 +1,487 @@
+"""Graph convolutions on states laid out as [node, batch, channel], and the encoder and decoder stacks made of them.
+
+The layout is the point: a state (n, b, c) is, without a copy, the matrix (n, b*c) that a sparse n x n operator
+multiplies in one product, and the matrix (n*b, c) whose channels one dense product mixes. The graph is the same for
+every sample, so its operator is normalised once, when it is made, and never again.
+
+How a level is assembled::
+
+    operator = GraphOperator(edges, n_nodes)                       # kind="cheb" | "gcn" | "gcn2"
+    encoder = GraphEncoder(operator, latent=4, channels=(3, 6, 12, 24), order=3)
+    decoder = GraphDecoder(operator, latent=4, channels=(24, 12, 6, 3), order=3)
+    z = encoder(x)                                                  # (n, b, 3) -> (b, 4)
+    both = decoder(torch.cat([z, mlp(inputs)]))                     # (2b, 4) -> (n, 2b, 3): one pass for both losses
+    reconstruction, approximation = both.chunk(2, dim=1)
+
+`with exportable(model): torch.export.export(...)` swaps every operator for its dense form while it lasts, which
+torch.export and ONNX accept.
+
+Sources: Defferrard, Bresson, Vandergheynst 2016 (ChebConv); Kipf and Welling 2017 (GCNConv); Chen et al. 2020
+(GCN2Conv, GCNII); Kneifl et al. 2024, section 3.3 (the stacks).
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import pairwise
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from scipy import sparse
+from scipy.sparse.linalg import eigsh
+from torch import Tensor, nn
+from torch.nn import functional
+
+from surrogates.errors import SurrogateError
+
+Kind = Literal["cheb", "gcn", "gcn2"]
+Form = Literal["auto", "sparse", "dense"]
+
+# Up to this many nodes one small dense product beats the sparse one; measured with `benchmarks/train_step.py --forms`.
+DENSE_UP_TO = {"cpu": 32, "cuda": 512, "mps": 4096}
+
+
+class GraphOperator:
+    """The symmetric n x n matrix that moves a state along the edges of one graph.
+
+    kind "cheb"           2 L / lambda_max - I with L = I - D^-1/2 A D^-1/2; lambda_max is L's largest eigenvalue
+    kind "gcn" or "gcn2"  (D + I)^-1/2 (A + I) (D + I)^-1/2
+
+    edges    (e, 2) int, undirected; both directions, repeated edges and loops are allowed and count once (loops not)
+    n_nodes  number of nodes; a node without an edge has D^-1/2 = 0, so its row of L is that of I
+    form     "sparse", "dense", or "auto": dense up to `DENSE_UP_TO` nodes of the device in use
+
+    Raises SurrogateError where an edge names a node that is not there, or the graph has no node.
+    """
+
+    def __init__(self, edges: ArrayLike, n_nodes: int, kind: Kind = "cheb", form: Form = "auto") -> None:
+        if kind not in ("cheb", "gcn", "gcn2"):
+            raise SurrogateError(f"convolution {kind!r} is unknown; choose cheb, gcn or gcn2")
+        self.n_nodes = int(n_nodes)
+        self.kind = kind
+        self.form: Form = form
+        adjacency = _adjacency(np.asarray(edges), self.n_nodes)
+        if kind == "cheb":
+            laplacian = normalised_laplacian(adjacency)
+            self.lambda_max = largest_eigenvalue(laplacian)
+            matrix = 2.0 / self.lambda_max * laplacian - sparse.identity(self.n_nodes)
+        else:
+            self.lambda_max = math.nan
+            matrix = _scaled_by_degree(adjacency + sparse.identity(self.n_nodes))
+        self.matrix: sparse.csr_matrix = sparse.csr_matrix(matrix)
+        self.matrix.sort_indices()
+        self._tensors: dict[tuple[torch.device, torch.dtype], Tensor] = {}
+
+    def dense_form(self) -> GraphOperator:
+        """The same operator held as a dense matrix (n, n), as torch.export and ONNX need it."""
+        return self.with_form("dense")
+
+    def with_form(self, form: Form) -> GraphOperator:
+        """The same operator in another form; the graph is not normalised again."""
+        other = object.__new__(GraphOperator)
+        other.__dict__.update(self.__dict__)
+        other.form = form
+        other._tensors = {}
+        return other
+
+    def tensor(self, device: torch.device, dtype: torch.dtype) -> Tensor:
+        """The matrix (n, n) on `device`: CSR or dense as the form says. Made once for each device and dtype."""
+        key = (device, dtype)
+        if key not in self._tensors:
+            self._tensors[key] = self._make(device, dtype)
+        return self._tensors[key]
+
+    def is_dense(self, device: torch.device) -> bool:
+        """Whether the dense form is used on `device`."""
+        if self.form == "auto":
+            return self.n_nodes <= DENSE_UP_TO.get(device.type, DENSE_UP_TO["cpu"])
+        return self.form == "dense"
+
+    def propagate(self, x: Tensor) -> Tensor:
+        """The operator times x: (n, ...) -> (n, ...). Differentiable any number of times, in both modes."""
+        return _Propagate.apply(x, self) if not self.is_dense(x.device) else self._times(x)
+
+    def _times(self, x: Tensor) -> Tensor:
+        flat = x.reshape(self.n_nodes, -1)
+        return torch.mm(self.tensor(x.device, x.dtype), flat).reshape(x.shape)
+
+    def _make(self, device: torch.device, dtype: torch.dtype) -> Tensor:
+        if self.is_dense(device):
+            return torch.from_numpy(self.matrix.toarray()).to(device, dtype)
+        rows, columns = (torch.from_numpy(part.astype(np.int32)) for part in (self.matrix.indptr, self.matrix.indices))
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta state")
+            csr = torch.sparse_csr_tensor(
+                rows, columns, torch.from_numpy(self.matrix.data), size=self.matrix.shape, check_invariants=True
+            )
+            return csr.to(device=device, dtype=dtype)
+
+    def __repr__(self) -> str:
+        return f"GraphOperator({self.n_nodes} nodes, {self.matrix.nnz} entries, {self.kind}, {self.form})"
+
+
+def normalised_laplacian(adjacency: sparse.spmatrix) -> sparse.csr_matrix:
+    """L = I - D^-1/2 A D^-1/2 (n, n) of a symmetric 0/1 adjacency (n, n); D^-1/2 is 0 where a node has no edge."""
+    return sparse.csr_matrix(sparse.identity(adjacency.shape[0]) - _scaled_by_degree(adjacency))
+
+
+def largest_eigenvalue(laplacian: sparse.spmatrix) -> float:
+    """lambda_max of a symmetric positive semi-definite matrix (n, n), to machine precision."""
+    n = laplacian.shape[0]
+    if n <= 64:
+        return float(np.linalg.eigvalsh(laplacian.toarray())[-1])
+    start = np.random.default_rng(0).standard_normal(n)
+    return float(eigsh(laplacian, k=1, which="LA", v0=start, return_eigenvectors=False)[0])
+
+
+def _adjacency(edges: NDArray[Any], n_nodes: int) -> sparse.csr_matrix:
+    """Symmetric 0/1 adjacency (n, n) without loops."""
+    if n_nodes < 1:
+        raise SurrogateError(f"a graph of {n_nodes} nodes was asked for; it needs at least one")
+    edges = edges.reshape(0, 2) if edges.size == 0 else edges
+    if edges.ndim != 2 or edges.shape[1] != 2:
+        raise SurrogateError(f"edges have the shape {edges.shape}; expected (edge, 2)")
+    edges = edges.astype(np.int64)
+    if edges.size and (edges.min() < 0 or edges.max() >= n_nodes):
+        raise SurrogateError(f"edges name the nodes {edges.min()} to {edges.max()}; the graph has 0 to {n_nodes - 1}")
+    i, j = edges[edges[:, 0] != edges[:, 1]].T
+    one = sparse.csr_matrix((np.ones(len(i)), (i, j)), shape=(n_nodes, n_nodes))
+    return sparse.csr_matrix(((one + one.T) > 0).astype(np.float64))
+
+
+def _scaled_by_degree(adjacency: sparse.spmatrix) -> sparse.csr_matrix:
+    """D^-1/2 A D^-1/2 with D the row sums of A."""
+    degree = np.asarray(adjacency.sum(axis=1)).ravel()
+    root = np.divide(1.0, np.sqrt(degree), out=np.zeros_like(degree), where=degree > 0)
+    return sparse.csr_matrix(sparse.diags(root) @ adjacency @ sparse.diags(root))
+
+
+class _Propagate(torch.autograd.Function):
+    """Sparse product with a symmetric matrix: its own transpose, so its derivative is itself."""
+
+    generate_vmap_rule = False
+
+    @staticmethod
+    def forward(x: Tensor, operator: GraphOperator) -> Tensor:
+        return operator._times(x)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.operator = inputs[1]
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        return _Propagate.apply(gradients[0], ctx.operator), None
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Tensor:
+        return _Propagate.apply(tangents[0], ctx.operator)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], x: Tensor, operator: GraphOperator) -> tuple[Tensor, int]:
+        # The operator acts on the first axis, so further axes ride along at the end.
+        return _Propagate.apply(x.movedim(in_dims[0] or 0, -1), operator), x.ndim - 1
+
+
+def _terms(matrix: Tensor, x: Tensor, order: int) -> list[Tensor]:
+    """T_0 x ... T_{order-1} x for x (n, m), by T_k = 2 L T_{k-1} - T_{k-2}."""
+    terms = [x]
+    if order > 1:
+        terms.append(torch.mm(matrix, x))
+    for _ in range(order - 2):
+        terms.append(torch.addmm(terms[-2], matrix, terms[-1], beta=-1, alpha=2))
+    return terms
+
+
+def _clenshaw(matrix: Tensor, coefficients: list[Tensor]) -> Tensor:
+    """sum_k T_k c_k for c_k (n, m): as many products as `_terms`, on the coefficients' width."""
+    if len(coefficients) == 1:
+        return coefficients[0]
+    *lower, last = coefficients
+    previous: Tensor | None = None
+    for coefficient in reversed(lower[1:]):
+        following = torch.addmm(coefficient, matrix, last, alpha=2)
+        if previous is not None:
+            following = following - previous
+        previous, last = last, following
+    total = torch.addmm(lower[0], matrix, last)
+    return total if previous is None else total - previous
+
+
+def _cheb_forward(
+    matrix: Tensor, x: Tensor, weight: Tensor, bias: Tensor | None, elu: bool, *, inplace: bool
+) -> tuple[Tensor, list[Tensor]]:
+    """(sum_k T_k x W_k + b, then ELU) and the terms of x where they were made (the side with fewer channels moves)."""
+    order, channels, width = weight.shape
+    n, batch, _ = x.shape
+    terms: list[Tensor] = []
+    if channels <= width:
+        terms = _terms(matrix, x.reshape(n, -1), order)
+        rows = [term.view(-1, channels) for term in terms]
+        out = torch.mm(rows[0], weight[0]) if bias is None else torch.addmm(bias, rows[0], weight[0])
+        for row, mix in zip(rows[1:], weight[1:]):
+            out = torch.addmm(out, row, mix)
+    else:
+        rows_x = x.reshape(-1, channels)
+        mixed = [torch.mm(rows_x, weight[0]) if bias is None else torch.addmm(bias, rows_x, weight[0])]
+        mixed += [torch.mm(rows_x, mix) for mix in weight[1:]]
+        out = _clenshaw(matrix, [part.view(n, -1) for part in mixed])
+    out = out.view(n, batch, width)
+    return (functional.elu(out, inplace=inplace) if elu else out), terms
+
+
+class _Cheb(torch.autograd.Function):
+    """One Chebyshev convolution with its ELU, and its gradient by hand: products on the narrow side both ways."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor | None, operator: GraphOperator, elu: bool) -> Tensor:
+        x = x.contiguous()
+        matrix = operator.tensor(x.device, x.dtype)
+        out, terms = _cheb_forward(matrix, x, weight, bias, elu, inplace=True)
+        ctx.operator, ctx.elu, ctx.has_bias = operator, elu, bias is not None
+        ctx.save_for_backward(x, weight, out if elu else None, *terms[1:])
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        x, weight, out, *moved = ctx.saved_tensors
+        gradient = gradients[0].contiguous()
+        order, channels, width = weight.shape
+        n = x.shape[0]
+        matrix = ctx.operator.tensor(x.device, x.dtype)
+        if ctx.elu:
+            gradient = torch.ops.aten.elu_backward(gradient, 1.0, 1.0, 1.0, True, out)
+        rows = gradient.view(-1, width)
+        gradient_bias = rows.sum(dim=0) if ctx.has_bias else None
+        gradient_x: Tensor | None = None
+        if channels <= width:
+            terms = [x, *moved]
+            gradient_weight = torch.stack([term.view(-1, channels).t() @ rows for term in terms])
+            if ctx.needs_input_grad[0]:
+                gradient_x = _clenshaw(matrix, [(rows @ mix.t()).view(n, -1) for mix in weight])
+        else:
+            terms = [term.view(-1, width) for term in _terms(matrix, gradient.view(n, -1), order)]
+            rows_x = x.view(-1, channels)
+            gradient_weight = torch.stack([rows_x.t() @ term for term in terms])
+            if ctx.needs_input_grad[0]:
+                gradient_x = terms[0] @ weight[0].t()
+                for term, mix in zip(terms[1:], weight[1:]):
+                    gradient_x.addmm_(term, mix.t())
+        return None if gradient_x is None else gradient_x.view(x.shape), gradient_weight, gradient_bias, None, None
+
+
+class ChebConv(nn.Module):
+    """y = sum_k T_k(L) x W_k + b, then ELU if asked: (node, batch, in) -> (node, batch, out).
+
+    order     number of Chebyshev terms; 3 means T_0, T_1, T_2 (Defferrard et al. 2016, equation 4)
+    operator  a GraphOperator of kind "cheb"
+    elu       apply ELU to the result, in place
+
+    Parameters: weight (order, in, out), Glorot-uniform for each term; bias (out), zero.
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        order: int,
+        operator: GraphOperator,
+        *,
+        bias: bool = True,
+        elu: bool = False,
+    ) -> None:
+        super().__init__()
+        if order < 1:
+            raise SurrogateError(f"Chebyshev order is {order}; at least one term (order 1) is needed")
+        _need_kind(operator, ("cheb",), "ChebConv")
+        self.operator = operator
+        self.elu = elu
+        self.weight = nn.Parameter(torch.empty(order, in_channels, out_channels))
+        self.bias = nn.Parameter(torch.zeros(out_channels)) if bias else None
+        bound = math.sqrt(6.0 / (in_channels + out_channels))
+        nn.init.uniform_(self.weight, -bound, bound)
+
+    def forward(self, x: Tensor) -> Tensor:
+        _check_state(x, self.operator, self.weight.shape[1])
+        if self.operator.form == "dense":  # plain operations: exportable, differentiable twice
+            matrix = self.operator.tensor(x.device, x.dtype)
+            return _cheb_forward(matrix, x, self.weight, self.bias, self.elu, inplace=False)[0]
+        return _Cheb.apply(x, self.weight, self.bias, self.operator, self.elu)
+
+    def extra_repr(self) -> str:
+        order, channels, width = self.weight.shape
+        return f"{channels}, {width}, order={order}, elu={self.elu}, {self.operator}"
+
+
+class GCNConv(nn.Module):
+    """y = P x W + b with P = (D + I)^-1/2 (A + I) (D + I)^-1/2 (Kipf and Welling 2017), then ELU if asked.
+
+    (node, batch, in) -> (node, batch, out). Parameters: weight (in, out), Glorot-uniform; bias (out), zero.
+    """
+
+    def __init__(
+        self, in_channels: int, out_channels: int, operator: GraphOperator, *, bias: bool = True, elu: bool = False
+    ) -> None:
+        super().__init__()
+        _need_kind(operator, ("gcn", "gcn2"), "GCNConv")
+        self.operator = operator
+        self.elu = elu
+        self.weight = nn.Parameter(torch.empty(in_channels, out_channels))
+        self.bias = nn.Parameter(torch.zeros(out_channels)) if bias else None
+        nn.init.xavier_uniform_(self.weight)
+
+    def forward(self, x: Tensor) -> Tensor:
+        channels, width = self.weight.shape
+        _check_state(x, self.operator, channels)
+        out = (
+            self.operator.propagate(x) @ self.weight if channels <= width else self.operator.propagate(x @ self.weight)
+        )
+        if self.bias is not None:
+            out = out + self.bias
+        return functional.elu(out) if self.elu else out
+
+
+class GCN2Conv(nn.Module):
+    """y = ((1 - alpha) P x + alpha x0) ((1 - beta) I + beta W), then ELU if asked (Chen et al. 2020, equation 5).
+
+    x and x0 (node, batch, channels) -> (node, batch, channels). beta = log(theta / layer + 1), `layer` counted from 1.
+    Parameter: weight (channels, channels), Glorot-uniform.
+    """
+
+    def __init__(
+        self,
+        channels: int,
+        operator: GraphOperator,
+        *,
+        layer: int = 1,
+        alpha: float = 0.1,
+        theta: float = 0.5,
+        elu: bool = False,
+    ) -> None:
+        super().__init__()
+        _need_kind(operator, ("gcn", "gcn2"), "GCN2Conv")
+        self.operator = operator
+        self.elu = elu
+        self.alpha = alpha
+        self.beta = math.log(theta / layer + 1.0)
+        self.weight = nn.Parameter(torch.empty(channels, channels))
+        nn.init.xavier_uniform_(self.weight)
+
+    def forward(self, x: Tensor, x0: Tensor) -> Tensor:
+        _check_state(x, self.operator, self.weight.shape[0])
+        h = (1.0 - self.alpha) * self.operator.propagate(x) + self.alpha * x0
+        out = (1.0 - self.beta) * h + self.beta * (h @ self.weight)
+        return functional.elu(out) if self.elu else out
+
+
+class Convolutions(nn.Module):
+    """The convolutions of one encoder or decoder: (node, batch, channels[0]) -> (node, batch, channels[-1]).
+
+    The operator's kind chooses the layer. ELU follows every layer; `linear_end` leaves it out after the last one.
+    "gcn2" needs one width throughout, so it works at the widest of `channels` between two linear maps at the nodes.
+    """
+
+    def __init__(self, operator: GraphOperator, channels: Sequence[int], order: int = 3, *, linear_end: bool) -> None:
+        super().__init__()
+        if len(channels) < 2:
+            raise SurrogateError(f"channels are {tuple(channels)}; at least an input and an output width are needed")
+        self.operator = operator
+        steps = list(pairwise(channels))
+        elu = [True] * (len(steps) - 1) + [not linear_end]
+        self.before: nn.Module = nn.Identity()
+        self.after: nn.Module = nn.Identity()
+        if operator.kind == "cheb":
+            layers: list[nn.Module] = [ChebConv(a, b, order, operator, elu=e) for (a, b), e in zip(steps, elu)]
+        elif operator.kind == "gcn":
+            layers = [GCNConv(a, b, operator, elu=e) for (a, b), e in zip(steps, elu)]
+        else:
+            width = max(channels)
+            if channels[0] != width:
+                self.before = nn.Linear(channels[0], width)
+            if channels[-1] != width:
+                self.after = nn.Linear(width, channels[-1])
+            layers = [GCN2Conv(width, operator, layer=i + 1, elu=True) for i in range(len(steps))]
+        self.layers = nn.ModuleList(layers)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = self.before(x)
+        x0 = x
+        for layer in self.layers:
+            x = layer(x, x0) if isinstance(layer, GCN2Conv) else layer(x)
+        return self.after(x)
+
+
+class GraphEncoder(nn.Module):
+    """Convolutions, then one dense linear layer: x (node, batch, channels[0]) -> z (batch, latent).
+
+    Source: Kneifl et al. 2024, section 3.3 and table 1. Parameters of the dense layer: weight (node, channel, latent)
+    and bias (latent).
+    """
+
+    def __init__(
+        self, operator: GraphOperator, latent: int, channels: Sequence[int] = (3, 6, 12, 24), order: int = 3
+    ) -> None:
+        super().__init__()
+        self.convolutions = Convolutions(operator, channels, order, linear_end=False)
+        self.dense = nn.Linear(operator.n_nodes * channels[-1], latent)
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = self.convolutions(x)
+        return self.dense(h.transpose(0, 1).reshape(h.shape[1], -1))
+
+
+class GraphDecoder(nn.Module):
+    """One dense layer with ELU, then convolutions, the last linear: z (batch, latent) -> (node, batch, channels[-1]).
+
+    Source: Kneifl et al. 2024, section 3.3 and table 1: the encoder in reverse order.
+    """
+
+    def __init__(
+        self, operator: GraphOperator, latent: int, channels: Sequence[int] = (24, 12, 6, 3), order: int = 3
+    ) -> None:
+        super().__init__()
+        self.n_nodes = operator.n_nodes
+        self.dense = nn.Linear(latent, operator.n_nodes * channels[0])
+        self.convolutions = Convolutions(operator, channels, order, linear_end=True)
+
+    def forward(self, z: Tensor) -> Tensor:
+        h = functional.elu(self.dense(z)).view(z.shape[0], self.n_nodes, -1)
+        return self.convolutions(h.transpose(0, 1).contiguous())
+
+
+@contextmanager
+def exportable(model: nn.Module) -> Iterator[nn.Module]:
+    """Inside, every operator of `model` is in its dense form and made for the model's weights: fit for torch.export."""
+    dense: dict[int, GraphOperator] = {}
+    before: list[tuple[nn.Module, GraphOperator]] = []
+    like = next(model.parameters())
+    for module in model.modules():
+        operator = getattr(module, "operator", None)
+        if isinstance(operator, GraphOperator):
+            before.append((module, operator))
+            form = dense.setdefault(id(operator), operator.dense_form())
+            form.tensor(like.device, like.dtype)
+            module.operator = form  # type: ignore[assignment]
+    try:
+        yield model
+    finally:
+        for module, operator in before:
+            module.operator = operator  # type: ignore[assignment]
+
+
+def _need_kind(operator: GraphOperator, kinds: tuple[str, ...], layer: str) -> None:
+    if operator.kind not in kinds:
+        raise SurrogateError(f"{layer} was given an operator of kind {operator.kind!r}; it needs {' or '.join(kinds)}")
+
+
+def _check_state(x: Tensor, operator: GraphOperator, channels: int) -> None:
+    if x.ndim != 3 or x.shape[0] != operator.n_nodes or x.shape[2] != channels:
+        raise SurrogateError(
+            f"a state has the shape {tuple(x.shape)}; expected ({operator.n_nodes} nodes, batch, {channels} channels)"
+        )
