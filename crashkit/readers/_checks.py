@@ -1,0 +1,61 @@
+"""What every reader checks in the same words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crashkit.errors import CrashkitError, ReadError
+from crashkit.readers.base import Run
+
+
+class EachRun(Iterator[Run]):
+    """Runs opened one after the other; one that cannot be opened raises, and the next call goes on behind it."""
+
+    def __init__(self, openers: Sequence[Callable[[], Run]]) -> None:
+        self._openers = iter(openers)
+
+    def __next__(self) -> Run:
+        return next(self._openers)()
+
+
+def time_problems(time: NDArray[np.float64], places: Sequence[object]) -> list[str]:
+    """Sentences about states whose time is not finite or not after the one before; `places` names the states."""
+    for k, value in enumerate(time):
+        if not np.isfinite(value):
+            return [f"{places[k]}: its time is {value}; expected a number"]
+        if k and value <= time[k - 1]:
+            return [f"{places[k]}: its time {value:g} is not after {time[k - 1]:g}, that of {places[k - 1]}"]
+    return []
+
+
+def require_finite(values: NDArray[np.floating], what: str, place: str) -> None:
+    """Raise ReadError with the first index where `values` (node, ...) are no numbers; `place` is file and state."""
+    good = np.isfinite(values)
+    if not good.all():
+        index = int(np.argwhere(~good)[0][0])
+        raise ReadError(
+            f"{place}: {what} of entry {index} is not a finite number ({int((~good).sum())} such values); "
+            "the run diverged or the file is damaged"
+        )
+
+
+def require_indices(nodes: NDArray[np.integer], count: int, what: str, place: object, lowest: int = 0) -> None:
+    """Raise ReadError where a node number in `nodes` is outside lowest .. count - 1."""
+    if nodes.size and (nodes.min() < lowest or nodes.max() >= count):
+        wrong = (nodes < lowest) | (nodes >= count)
+        row = int(np.argwhere(wrong)[0][0])
+        raise ReadError(
+            f"{place}: {what} {row} names node {int(nodes[wrong][0])}; expected {lowest} to {count - 1}; "
+            "the file is damaged"
+        )
+
+
+def require_options(reader: str, options: Mapping[str, object], known: Sequence[str] = ()) -> None:
+    """Raise CrashkitError for an option that is given but not known to the reader."""
+    for name, value in options.items():
+        if value is not None and name not in known:
+            ours = f"its options are {', '.join(known)}" if known else "it has no options"
+            raise CrashkitError(f"reader {reader!r} has no option {name!r}; {ours}")

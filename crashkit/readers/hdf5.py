@@ -1,0 +1,259 @@
+"""The HDF5 layout of the public kart data set: all runs of a campaign in one file.
+
+    kart/displacements            (run, state, node, 3)
+    kart/reference_configuration  (run, node, 3), or (node, 3) where all runs start alike
+    kart/faces                    (triangle, 3), 0-based; or a mesh file beside it (option `mesh`)
+    kart/<field>                  (run, state, node | face [, 3]), such as plastic_strain
+    parameter                     (run, parameter), with attributes `names` and `units`
+    time                          (state,), or (run, state)
+
+Any group name will do. Lengths in metre are told by the attribute `units` of the displacements; then the unit
+system is SI, else the user must say.
+
+The public file has no names of parameters. Where the group is called `kart` and `parameter` has three columns
+without names, they are taken to be that campaign's: impact_speed in m/s, impact_angle in degree, yield_stress in MPa.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crashkit.errors import ReadError
+from crashkit.readers import register
+from crashkit.readers._checks import EachRun, require_finite, require_indices, require_options, time_problems
+from crashkit.readers._names import quantity
+from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh
+
+if TYPE_CHECKING:
+    import h5py
+
+_MAGIC = b"\x89HDF\r\n\x1a\n"
+_NEEDED = ("displacements", "reference_configuration")
+_KART_PARAMETERS = (("impact_speed", "m s-1"), ("impact_angle", "degree"), ("yield_stress", "MPa"))
+_METRE = ("m", "metre", "meter")
+# One chunk may hold all states of a run; the cache keeps it while its states are read slice by slice.
+_CHUNK_CACHE = 96 << 20
+
+
+class KartHdf5:
+    """Reader of the layout above; the option `mesh` names a file with the faces where the data has none."""
+
+    name = "kart-hdf5"
+    description = "HDF5 in the layout of the public kart data set (displacements, reference_configuration, parameter)"
+
+    def sniff(self, path: Path) -> bool:
+        import h5py
+
+        try:
+            if not path.is_file():
+                return False
+            with path.open("rb") as stream:
+                if stream.read(8) != _MAGIC:
+                    return False
+            with h5py.File(path, "r") as file:
+                return _group(file) is not None
+        except (OSError, RuntimeError, KeyError, ValueError):
+            return False
+
+    def runs(self, path: Path, **options: object) -> Iterator[Run]:
+        require_options(self.name, options, ("mesh",))
+        mesh = options.get("mesh")
+        campaign = _Campaign(path, None if mesh is None else Path(str(mesh)))
+        return EachRun([partial(_KartRun, campaign, k) for k in range(campaign.runs)])
+
+
+def _open(path: Path) -> h5py.File:
+    import h5py
+
+    try:
+        return h5py.File(path, "r", rdcc_nbytes=_CHUNK_CACHE)
+    except FileNotFoundError:
+        raise ReadError(f"{path}: no such file") from None
+    except OSError as error:
+        raise ReadError(f"{path}: not readable as HDF5 ({error}); copy the file again") from error
+
+
+def _group(file: h5py.File) -> str | None:
+    """Name of the top group with the displacements ("/" where they stand at the top)."""
+    import h5py
+
+    for name in (*file, "/"):
+        found = file.get(name)
+        if isinstance(found, h5py.Group) and all(isinstance(found.get(n), h5py.Dataset) for n in _NEEDED):
+            return str(name)
+    return None
+
+
+class _Campaign:
+    """The file, opened once for all its runs, with everything they share."""
+
+    def __init__(self, path: Path, mesh: Path | None) -> None:
+        self.path = path
+        self.file = _open(path)
+        group = _group(self.file)
+        if group is None:
+            raise ReadError(
+                f"{path}: no group with datasets {' and '.join(_NEEDED)}; found {', '.join(self.file) or 'nothing'}"
+            )
+        self.group = group
+        self.displacements = self._dataset("displacements", 4)
+        self.runs, self.states, self.nodes, xyz = self.displacements.shape
+        if xyz != 3 or 0 in self.displacements.shape:
+            raise self._wrong("displacements", "(run, state, node, 3), none of them 0")
+        self.reference = self._dataset("reference_configuration", 2, 3)
+        if self.reference.shape[-2:] != (self.nodes, 3) or self.reference.shape[:-2] not in ((), (self.runs,)):
+            raise self._wrong("reference_configuration", f"({self.runs}, {self.nodes}, 3)")
+        self.mesh_file = mesh
+        self.faces = self._faces(mesh)
+        self.time = self._time()
+        self.parameters = self._parameters()
+        self.fields = self._fields()
+        unit = _text(self.displacements.attrs.get("units", ""))
+        self.units = "SI" if unit in _METRE else None
+
+    def _dataset(self, name: str, *dimensions: int) -> h5py.Dataset:
+        import h5py
+
+        found = self.file[self.group].get(name)
+        if not isinstance(found, h5py.Dataset):
+            found = self.file.get(name)
+        if not isinstance(found, h5py.Dataset):
+            raise ReadError(f"{self.path}: no dataset {name}; found {', '.join(self.file[self.group])}")
+        if found.dtype.kind not in "fiu" or (dimensions and found.ndim not in dimensions):
+            raise ReadError(
+                f"{self.path}: {found.name} has shape {found.shape} and type {found.dtype}; "
+                f"expected numbers with {' or '.join(map(str, dimensions))} dimensions"
+            )
+        return found
+
+    def _wrong(self, name: str, expected: str) -> ReadError:
+        found = self._dataset(name)
+        return ReadError(f"{self.path}: {found.name} has shape {found.shape}, expected {expected}")
+
+    def read(self, dataset: h5py.Dataset, *index: Any) -> NDArray[Any]:
+        """`dataset[index]`, with damage on the disk told by name and place."""
+        try:
+            return np.asarray(dataset[index])
+        except (OSError, RuntimeError) as error:
+            raise ReadError(
+                f"{self.path}: {dataset.name}{list(index)} cannot be read ({error}); the file is damaged, copy it again"
+            ) from error
+
+    def _time(self) -> NDArray[np.float64]:
+        time = self._dataset("time", 1, 2)
+        if time.shape not in ((self.states,), (self.runs, self.states)):
+            raise self._wrong("time", f"({self.states},) or ({self.runs}, {self.states})")
+        return np.broadcast_to(self.read(time, ...).astype(np.float64), (self.runs, self.states))
+
+    def _faces(self, mesh: Path | None) -> NDArray[np.int32]:
+        found = self.file[self.group].get("faces")
+        if found is not None:
+            faces = self._dataset("faces", 2)
+            if faces.shape[1] not in (3, 4) or faces.dtype.kind not in "iu":
+                raise self._wrong("faces", "whole numbers, (face, 3) or (face, 4)")
+            nodes = self.read(faces, ...).astype(np.int64)
+            require_indices(nodes, self.nodes, "face", f"{self.path}: {faces.name}", lowest=-1)
+            return nodes.astype(np.int32)
+        if mesh is None:
+            raise ReadError(
+                f"{self.path}: no dataset {self.group}/faces, so the mesh is not known; "
+                "name a mesh file with the same nodes (--mesh FILE)"
+            )
+        from crashkit.readers._mesh_file import faces_of
+
+        return faces_of(mesh, self.read(self.reference, *((0,) if self.reference.ndim == 3 else (...,))))
+
+    def _parameters(self) -> list[dict[str, Parameter]]:
+        if "parameter" not in self.file and "parameter" not in self.file[self.group]:
+            return [{} for _ in range(self.runs)]
+        table = self._dataset("parameter", 2)
+        if table.shape[0] != self.runs:
+            raise self._wrong("parameter", f"({self.runs}, any)")
+        names = [_text(n) for n in np.atleast_1d(table.attrs.get("names", []))]
+        units = [_text(u) for u in np.atleast_1d(table.attrs.get("units", [""] * len(names)))]
+        if not names and self.group == "kart" and table.shape[1] == len(_KART_PARAMETERS):
+            names, units = (list(column) for column in zip(*_KART_PARAMETERS, strict=True))
+        if not names:  # numbers without a name are of no use to anybody
+            return [{} for _ in range(self.runs)]
+        if not len(names) == len(units) == table.shape[1]:
+            raise ReadError(
+                f"{self.path}: {table.name} has {table.shape[1]} columns, {len(names)} names and {len(units)} units; "
+                "expected as many of each"
+            )
+        rows = self.read(table, ...).astype(np.float64)
+        return [{n: Parameter(float(v), u) for n, v, u in zip(names, row, units, strict=True)} for row in rows]
+
+    def _fields(self) -> dict[str, FieldInfo]:
+        import h5py
+
+        fields = {}
+        for name, found in self.file[self.group].items():
+            if not isinstance(found, h5py.Dataset) or found.dtype.kind not in "fiu" or name == "displacements":
+                continue
+            if found.shape[:2] != (self.runs, self.states) or found.ndim not in (3, 4):
+                continue
+            places = {self.nodes: "node", len(self.faces): "face"}
+            place = _text(found.attrs.get("location", "")) or places.get(found.shape[2])
+            if place in ("node", "face"):
+                components = found.shape[3] if found.ndim == 4 else 1
+                fields[name] = FieldInfo(name, place, components, quantity(name))  # type: ignore[arg-type]
+        return fields
+
+
+class _KartRun(Run):
+    """One row of the file."""
+
+    def __init__(self, campaign: _Campaign, index: int) -> None:
+        self._campaign, self._index = campaign, index
+        digits = max(3, len(str(campaign.runs - 1)))
+        self.name = f"run_{index:0{digits}d}"
+        self.solver = _text(campaign.file.attrs.get("source", "")) or "unknown"
+        self.files = (campaign.path,) if campaign.mesh_file is None else (campaign.path, campaign.mesh_file)
+        self.time = np.array(campaign.time[index])
+        self.parameters: Mapping[str, Parameter] = campaign.parameters[index]
+        self.fields: Mapping[str, FieldInfo] = campaign.fields
+        self.units = campaign.units
+        reference = campaign.reference
+        position = campaign.read(reference, *((index,) if reference.ndim == 3 else (...,))).astype(np.float64)
+        require_finite(position, "the reference position", f"{campaign.path}: {reference.name}, {self.name}")
+        faces = campaign.faces
+        self.mesh = RunMesh(
+            position=position,
+            node_id=np.arange(1, len(position) + 1),
+            face_nodes=faces,
+            face_part=np.zeros(len(faces), np.int32),
+            face_id=np.arange(1, len(faces) + 1),
+            parts=(Part(1, campaign.group.strip("/") or "structure"),),
+        )
+        self.problems = tuple(
+            time_problems(self.time, [f"{campaign.path}: time, {self.name}, state {k}" for k in range(len(self.time))])
+        )
+
+    def _place(self, name: str) -> str:
+        return f"{self._campaign.path}: {self._campaign.group}/{name}, {self.name}"
+
+    def displacement(self, first: int, last: int) -> NDArray[np.float32]:
+        dataset = self._campaign.displacements
+        values = self._campaign.read(dataset, self._index, slice(first, last)).astype(np.float32, copy=False)
+        for k, state in enumerate(values, first):
+            require_finite(state, "the displacement", f"{self._place('displacements')}, state {k}")
+        return values
+
+    def field(self, name: str, first: int, last: int) -> NDArray[np.float32]:
+        if name not in self.fields:
+            raise KeyError(name)
+        dataset = self._campaign.file[self._campaign.group][name]
+        return self._campaign.read(dataset, self._index, slice(first, last)).astype(np.float32, copy=False)
+
+
+def _text(value: object) -> str:
+    return value.decode() if isinstance(value, bytes) else str(value)
+
+
+register(KartHdf5())
