@@ -18,6 +18,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from io import FileIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
@@ -37,6 +38,7 @@ Arrays = Mapping[str, NDArray[Any]]
 # zlib level 1: levels above cost time and win next to nothing on floating point numbers.
 _COMPRESSION = 1
 _VTK_LINE, _VTK_TRIANGLE, _VTK_QUAD = 3, 5, 9
+_COMPONENTS = 9  # of a full tensor, the widest array there is
 _HIDDEN_CELL = 32  # vtkDataSetAttributes::HIDDENCELL
 
 
@@ -74,7 +76,6 @@ def write_paraview(
     time        (t,) s
     point_data  name -> (t, n) or (t, n, components), or without t where an array is the same in all states.
                 Anything that can be indexed by state will do (numpy, HDF5, Zarr): one state is read at a time.
-                Shape (t, n) is taken before (n, components) if both fit.
     cell_data   the same with c = m + number of lines values, faces first
     lines       (e, 2) edges without a face, written behind the faces
     units       name of an array -> its unit, kept in the file (VTU: UNITS_LABEL, VTKHDF: attribute `units`)
@@ -199,6 +200,11 @@ def _sort(arrays: Mapping[str, Any], states: int, size: int, what: str) -> tuple
     for name, values in arrays.items():
         values = values if hasattr(values, "shape") else np.asarray(values)
         shape = tuple(values.shape)
+        if shape == (states, size) and states == size <= _COMPONENTS:
+            raise DataError(
+                f"array {name!r} has shape {shape}: {states} states x {size} {what}, or {size} {what} x {size} "
+                "components? Give it a third axis to tell: (states, size, components)"
+            )
         if shape[:2] == (states, size) and len(shape) in (2, 3):
             moving[name] = values
         elif shape[:1] == (size,) and len(shape) in (1, 2):
@@ -389,8 +395,9 @@ def _xml_writer(mesh: _Mesh, constant: State, units: Mapping[str, str], polydata
         add(output.GetFieldData(), "TimeValue", np.array([time]))
         writer = (vtkXMLPolyDataWriter if polydata else vtkXMLUnstructuredGridWriter)()
         problems: list[str] = []
-        observe: Any = writer.AddObserver  # its stubs know numbers of events only, not their names
-        observe("ErrorEvent", lambda *_: problems.append("error"))  # else VTK writes to stderr
+        speaker: Any
+        for speaker in (writer, writer.GetExecutive()):  # else VTK writes its errors to stderr
+            speaker.AddObserver("ErrorEvent", lambda *_: problems.append("error"))
         writer.SetFileName(os.fspath(path))
         writer.SetInputData(output)
         writer.SetDataModeToAppended()
@@ -467,7 +474,7 @@ def _write_vtkhdf(
     import h5py
 
     n, c, t = mesh.n_points, mesh.n_cells, times.size
-    with h5py.File(path, "w") as file:
+    with _Disk(path, "w+") as disk, h5py.File(disk, "w") as file:
         root = file.create_group("VTKHDF", track_order=True)
         root.attrs["Version"] = np.array([2, 0], np.int64)
         root.attrs.create("Type", "UnstructuredGrid", dtype=h5py.string_dtype("ascii", len("UnstructuredGrid")))
@@ -509,6 +516,39 @@ def _write_vtkhdf(
             for (group, _), arrays in zip(groups, (state.point_data, state.cell_data), strict=True):
                 for name, values in arrays.items():
                     group[name][k * len(values) : (k + 1) * len(values)] = values
+            disk.check()
+    disk.check()
+
+
+class _Disk(FileIO):
+    """A file for HDF5 that remembers what went wrong instead of saying so.
+
+    When writing fails, on a full disk, HDF5 cannot close its file any more and takes the interpreter with it. So
+    it is told that all went well until it has closed the file, and `check` says what really happened.
+    """
+
+    error: OSError | None = None
+
+    def check(self) -> None:
+        if self.error is not None:
+            raise self.error
+
+    def write(self, data: Any) -> int:
+        view = memoryview(data).cast("B")
+        done = 0
+        while done < len(view) and self.error is None:
+            try:
+                done += super().write(view[done:])
+            except OSError as error:
+                self.error = error
+        return len(view)
+
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.error = self.error or error
+            return size or 0
 
 
 def _dataset(group: h5py.Group, name: str, values: NDArray[Any], unit: str | None = None) -> h5py.Dataset:
