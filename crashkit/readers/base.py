@@ -133,9 +133,10 @@ class Reader(Protocol):
         """
 
     def runs(self, path: Path, **options: object) -> Iterator[Run]:
-        """The runs in `path`, opened one after the other.
+        """The runs in `path`, opened one after the other when the iterator gets there.
 
-        Raises crashkit.errors.ReadError, naming the file and the place in it.
+        Raises crashkit.errors.ReadError, naming the file and the place in it. The iterators of this folder go on
+        behind a run that raised, so that one damaged run does not hide the others.
         """
 
 
