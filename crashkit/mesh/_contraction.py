@@ -1,0 +1,408 @@
+"""Compiled half-edge contraction: the loop that selects nodes.
+
+Plain arrays and numbers only, so that numba can compile it. Vertices carry symmetric 4x4 quadrics (ten numbers),
+faces and graph edges hang in linked lists, and every vertex waits in one binary heap with its cheapest contraction.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+_NONE = -1
+
+
+@njit(cache=True)
+def _evaluate(q, x, y, z):
+    """v^T Q v of a quadric stored as xx xy xz xw yy yz yw zz zw ww."""
+    return (
+        q[0] * x * x + 2 * q[1] * x * y + 2 * q[2] * x * z + 2 * q[3] * x
+        + q[4] * y * y + 2 * q[5] * y * z + 2 * q[6] * y
+        + q[7] * z * z + 2 * q[8] * z + q[9]
+    )  # fmt: skip
+
+
+@njit(cache=True)
+def _add_plane(q, nx, ny, nz, d, w):
+    q[0] += w * nx * nx
+    q[1] += w * nx * ny
+    q[2] += w * nx * nz
+    q[3] += w * nx * d
+    q[4] += w * ny * ny
+    q[5] += w * ny * nz
+    q[6] += w * ny * d
+    q[7] += w * nz * nz
+    q[8] += w * nz * d
+    q[9] += w * d * d
+
+
+@njit(cache=True)
+def _add_point(q, x, y, z, w):
+    """w |v - (x, y, z)|^2."""
+    q[0] += w
+    q[4] += w
+    q[7] += w
+    q[3] -= w * x
+    q[6] -= w * y
+    q[8] -= w * z
+    q[9] += w * (x * x + y * y + z * z)
+
+
+@njit(cache=True)
+def quadrics(position, faces, edges, edge_faces, edge_face, boundary, spread):
+    """Ten numbers a vertex: planes of its faces, planes across its open or branching edges, its own place.
+
+    `edge_faces` counts the faces of an edge, `edge_face` names one of them. `boundary` and `spread` weigh the
+    second and third part against the first; each is area times squared distance.
+    """
+    n = len(position)
+    out = np.zeros((n, 10))
+    normal = np.zeros((len(faces), 3))
+    for f in range(len(faces)):
+        a, b, c = faces[f]
+        e1 = position[b] - position[a]
+        e2 = position[c] - position[a]
+        nx = e1[1] * e2[2] - e1[2] * e2[1]
+        ny = e1[2] * e2[0] - e1[0] * e2[2]
+        nz = e1[0] * e2[1] - e1[1] * e2[0]
+        length = np.sqrt(nx * nx + ny * ny + nz * nz)
+        if length <= 0:
+            continue
+        nx, ny, nz = nx / length, ny / length, nz / length
+        normal[f] = nx, ny, nz
+        d = -(nx * position[a, 0] + ny * position[a, 1] + nz * position[a, 2])
+        third = length / 6
+        for v in (a, b, c):
+            _add_plane(out[v], nx, ny, nz, d, third)
+            _add_point(out[v], position[v, 0], position[v, 1], position[v, 2], spread * third)
+    for e in range(len(edges)):
+        if edge_faces[e] == 2:
+            continue
+        i, j = edges[e]
+        t = position[j] - position[i]
+        length2 = t[0] * t[0] + t[1] * t[1] + t[2] * t[2]
+        if length2 <= 0:
+            continue
+        if edge_faces[e] == 0:  # a lone edge: its own line, so that both directions across it cost
+            _add_point(out[i], position[i, 0], position[i, 1], position[i, 2], spread * length2)
+            _add_point(out[j], position[j, 0], position[j, 1], position[j, 2], spread * length2)
+            continue
+        m = normal[edge_face[e]]
+        nx = t[1] * m[2] - t[2] * m[1]
+        ny = t[2] * m[0] - t[0] * m[2]
+        nz = t[0] * m[1] - t[1] * m[0]
+        length = np.sqrt(nx * nx + ny * ny + nz * nz)
+        if length <= 0:
+            continue
+        nx, ny, nz = nx / length, ny / length, nz / length
+        d = -(nx * position[i, 0] + ny * position[i, 1] + nz * position[i, 2])
+        _add_plane(out[i], nx, ny, nz, d, boundary * length2)
+        _add_plane(out[j], nx, ny, nz, d, boundary * length2)
+    return out
+
+
+@njit(cache=True)
+def _less(cost, tie, a, b):
+    if cost[a] != cost[b]:
+        return cost[a] < cost[b]
+    return tie[a] < tie[b]
+
+
+@njit(cache=True)
+def _sift(heap, where, cost, tie, k, size):
+    """Put the entry at place k of the first `size` where it belongs, upwards or downwards."""
+    v = heap[k]
+    while k > 0:
+        up = (k - 1) // 2
+        if not _less(cost, tie, v, heap[up]):
+            break
+        heap[k] = heap[up]
+        where[heap[k]] = k
+        k = up
+    while True:
+        child = 2 * k + 1
+        if child >= size:
+            break
+        if child + 1 < size and _less(cost, tie, heap[child + 1], heap[child]):
+            child += 1
+        if not _less(cost, tie, heap[child], v):
+            break
+        heap[k] = heap[child]
+        where[heap[k]] = k
+        k = child
+    heap[k] = v
+    where[v] = k
+
+
+@njit(cache=True)
+def _flips(p, q, position, faces, face_head, face_next):
+    """How many of p's surviving faces would turn over if p moved to q."""
+    count = 0
+    c = face_head[p]
+    while c != _NONE:
+        f = c // 3
+        k = c - 3 * f
+        a, b = faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
+        if a != q and b != q:
+            e0, e1, e2 = (
+                position[b, 0] - position[a, 0],
+                position[b, 1] - position[a, 1],
+                position[b, 2] - position[a, 2],
+            )
+            u0, u1, u2 = (
+                position[p, 0] - position[a, 0],
+                position[p, 1] - position[a, 1],
+                position[p, 2] - position[a, 2],
+            )
+            w0, w1, w2 = (
+                position[q, 0] - position[a, 0],
+                position[q, 1] - position[a, 1],
+                position[q, 2] - position[a, 2],
+            )
+            dot = (
+                (e1 * u2 - e2 * u1) * (e1 * w2 - e2 * w1)
+                + (e2 * u0 - e0 * u2) * (e2 * w0 - e0 * w2)
+                + (e0 * u1 - e1 * u0) * (e0 * w1 - e1 * w0)
+            )
+            if dot < 0:
+                count += 1
+        c = face_next[c]
+    return count
+
+
+@njit(cache=True)
+def _holds_all(parts, p, q):
+    """Whether q lies on every part that p lies on."""
+    for w in range(parts.shape[1]):
+        if parts[p, w] & ~parts[q, w]:
+            return False
+    return True
+
+
+@njit(cache=True)
+def _best(p, position, quadric, faces, face_head, face_next, half_to, half_head, half_next, parts, join_parts, flip):
+    """Cheapest contraction p -> q, as (cost, q); q is -1 where none is allowed."""
+    best, target = np.inf, _NONE
+    h = half_head[p]
+    while h != _NONE:
+        q = half_to[h]
+        if join_parts or _holds_all(parts, p, q):
+            x, y, z = position[q, 0], position[q, 1], position[q, 2]
+            cost = max(_evaluate(quadric[p], x, y, z) + _evaluate(quadric[q], x, y, z), 0.0)
+            if cost < best or (cost == best and q < target):
+                cost *= 1 + flip * _flips(p, q, position, faces, face_head, face_next)
+                if cost < best or (cost == best and q < target):
+                    best, target = cost, q
+        h = half_next[h]
+    return best, target
+
+
+@njit(cache=True)
+def _unlink_corner(c, faces, face_head, face_next):
+    v = faces[c // 3, c % 3]
+    at = face_head[v]
+    if at == c:
+        face_head[v] = face_next[c]
+        return
+    while face_next[at] != c:
+        at = face_next[at]
+    face_next[at] = face_next[c]
+
+
+@njit(cache=True)
+def _drop_half(v, h, half_head, half_next):
+    at = half_head[v]
+    if at == h:
+        half_head[v] = half_next[h]
+        return
+    while half_next[at] != h:
+        at = half_next[at]
+    half_next[at] = half_next[h]
+
+
+@njit(cache=True)
+def _has_twin(q, a, b, part, faces, face_part, face_head, face_next):
+    """Whether q already carries a face of this part with the corners q, a, b."""
+    c = face_head[q]
+    while c != _NONE:
+        f = c // 3
+        if face_part[f] == part:
+            k = c - 3 * f
+            i, j = faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
+            if (i == a and j == b) or (i == b and j == a):
+                return True
+        c = face_next[c]
+    return False
+
+
+@njit(cache=True)
+def contract(position, quadric, faces, face_part, edges, is_pair, parts, tie, locked, count, join_parts, flip):
+    """Contract p -> q, cheapest first, until `count` vertices are left or no contraction is allowed.
+
+    position (n, 3), quadric (n, 10), faces (m, 3) int32, face_part (m,) int32, edges (e, 2) int32 without doubles,
+    is_pair (e,) bool: edge of a close pair, no edge of the graph; parts (n, words) uint64 bit sets, tie (n,)
+    decides between equal costs, locked (n,) bool: vertices that stay. `quadric`, `faces`, `edges`, `is_pair` and
+    `parts` are changed in place. Returns
+
+    into        (n,) int32: where each vertex went (itself where it was kept)
+    face_lives  (m,) bool and edge_lives (e,) bool: what is left of `faces` and `edges`, now between kept vertices
+    """
+    n = len(position)
+    face_lives = np.ones(len(faces), np.bool_)
+    edge_lives = np.ones(len(edges), np.bool_)
+    face_head = np.full(n, _NONE, np.int32)
+    face_next = np.full(3 * len(faces), _NONE, np.int32)
+    for c in range(3 * len(faces) - 1, -1, -1):
+        v = faces[c // 3, c % 3]
+        face_next[c] = face_head[v]
+        face_head[v] = c
+    half_head = np.full(n, _NONE, np.int32)
+    half_next = np.full(2 * len(edges), _NONE, np.int32)
+    half_to = np.empty(2 * len(edges), np.int32)
+    for h in range(2 * len(edges) - 1, -1, -1):
+        v = edges[h // 2, h % 2]
+        half_to[h] = edges[h // 2, 1 - h % 2]
+        half_next[h] = half_head[v]
+        half_head[v] = h
+
+    into = np.arange(n).astype(np.int32)
+    known = np.zeros(n, np.int32)
+    shared = np.full(n, _NONE, np.int32)
+    cost = np.full(n, np.inf)
+    target = np.full(n, _NONE, np.int32)
+    heap = np.arange(n).astype(np.int32)
+    where = np.arange(n).astype(np.int32)
+    for v in range(n):
+        if not locked[v]:
+            cost[v], target[v] = _best(
+                v,
+                position,
+                quadric,
+                faces,
+                face_head,
+                face_next,
+                half_to,
+                half_head,
+                half_next,
+                parts,
+                join_parts,
+                flip,
+            )
+    for k in range(n // 2, -1, -1):
+        _sift(heap, where, cost, tie, k, n)
+
+    left = n
+    stamp = 0
+    while left > count:
+        p = heap[0]
+        q = target[p]
+        if q == _NONE:
+            break
+        left -= 1
+        heap[0] = heap[left]
+        where[heap[0]] = 0
+        _sift(heap, where, cost, tie, 0, left)
+
+        into[p] = q
+        for k in range(10):
+            quadric[q, k] += quadric[p, k]
+        for w in range(parts.shape[1]):
+            parts[q, w] |= parts[p, w]
+
+        # Faces with both ends vanish; the others go over to q unless it has the same one already.
+        c = face_head[p]
+        while c != _NONE:
+            following = face_next[c]
+            f = c // 3
+            k = c - 3 * f
+            c1, c2 = 3 * f + (k + 1) % 3, 3 * f + (k + 2) % 3
+            a, b = faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
+            if a == q or b == q or _has_twin(q, a, b, face_part[f], faces, face_part, face_head, face_next):
+                _unlink_corner(c1, faces, face_head, face_next)
+                _unlink_corner(c2, faces, face_head, face_next)
+                face_lives[f] = False
+            else:
+                faces[f, k] = q
+                face_next[c] = face_head[q]
+                face_head[q] = c
+            c = following
+        face_head[p] = _NONE
+
+        # Neighbours of p become neighbours of q, each once; a graph edge outranks a close pair.
+        stamp += 1
+        h = half_head[q]
+        while h != _NONE:
+            r = half_to[h]
+            if r == p:
+                edge_lives[h // 2] = False
+                _drop_half(q, h, half_head, half_next)
+            else:
+                known[r] = stamp
+                shared[r] = h // 2
+            h = half_next[h]
+        h = half_head[p]
+        while h != _NONE:
+            following = half_next[h]
+            r = half_to[h]
+            if r != q:
+                if known[r] == stamp:
+                    if not is_pair[h // 2]:
+                        is_pair[shared[r]] = False
+                    edge_lives[h // 2] = False
+                    _drop_half(r, h ^ 1, half_head, half_next)
+                else:
+                    half_to[h ^ 1] = q
+                    edges[h // 2, h % 2] = q
+                    half_next[h] = half_head[q]
+                    half_head[q] = h
+            h = following
+        half_head[p] = _NONE
+
+        # The costs of q and its neighbours changed.
+        if not locked[q]:
+            cost[q], target[q] = _best(
+                q,
+                position,
+                quadric,
+                faces,
+                face_head,
+                face_next,
+                half_to,
+                half_head,
+                half_next,
+                parts,
+                join_parts,
+                flip,
+            )
+            _sift(heap, where, cost, tie, where[q], left)
+        h = half_head[q]
+        while h != _NONE:
+            r = half_to[h]
+            if not locked[r]:
+                cost[r], target[r] = _best(
+                    r,
+                    position,
+                    quadric,
+                    faces,
+                    face_head,
+                    face_next,
+                    half_to,
+                    half_head,
+                    half_next,
+                    parts,
+                    join_parts,
+                    flip,
+                )
+                _sift(heap, where, cost, tie, where[r], left)
+            h = half_next[h]
+
+    for v in range(n):
+        end = v
+        while into[end] != end:
+            end = into[end]
+        at = v
+        while into[at] != end and at != end:
+            following = into[at]
+            into[at] = end
+            at = following
+    return into, face_lives, edge_lives

@@ -1,0 +1,54 @@
+"""What a level costs: fine displacements restricted to the kept nodes and lifted back, U D u against u."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crashkit.mesh.levels import Hierarchy, Level
+
+
+@dataclass(frozen=True)
+class LiftingError:
+    """|U D u - u|, m: mean over nodes, states and runs, and the largest value."""
+
+    mean: float
+    largest: float
+
+
+class LiftingMeter:
+    """Adds up the lifting errors of all levels from blocks of displacements, so that runs can be streamed."""
+
+    def __init__(self, hierarchy: Hierarchy) -> None:
+        self._levels = hierarchy.levels
+        self._sum = np.zeros(len(self._levels))
+        self._count = np.zeros(len(self._levels))
+        self._largest = np.zeros(len(self._levels))
+
+    def add(self, displacement: NDArray[np.floating]) -> None:
+        """Take in displacements (state, node of level 0, 3), m. Nodes that are NaN before or after are left out."""
+        for k, level in enumerate(self._levels):
+            error = np.linalg.norm(lift(level, displacement[:, level.kept]) - displacement, axis=-1)
+            there = np.isfinite(error)
+            self._sum[k] += error[there].sum(dtype=np.float64)
+            self._count[k] += there.sum()
+            self._largest[k] = max(self._largest[k], error[there].max(initial=0.0))
+
+    @property
+    def errors(self) -> list[LiftingError]:
+        """One for each level, level 1 first; NaN where nothing was added."""
+        counts = np.where(self._count > 0, self._count, np.nan)
+        return [
+            LiftingError(float(s / c), float(m) if c == c else float("nan"))
+            for s, c, m in zip(self._sum, counts, self._largest, strict=True)
+        ]
+
+
+def lift(level: Level, displacement: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Displacements (state, node of `level`, 3) on level 0, (state, node, 3), by the level's static map U."""
+    states, nodes, _ = displacement.shape
+    flat = displacement.transpose(1, 0, 2).reshape(nodes, states * 3)
+    u = level.to_full.astype(displacement.dtype)
+    return (u @ flat).reshape(-1, states, 3).transpose(1, 0, 2)

@@ -1,0 +1,458 @@
+"""The hierarchy in the dataset: groups /hierarchy/level_1 .. of a .zarr folder or a .nc file.
+
+Group /hierarchy holds how the levels were made and which mesh and runs they belong to; each level holds its kept
+nodes, faces, edges, adjacency and probe maps (CSR parts), distances and lifting errors; level 1 also holds the
+displacements of its nodes, of which those of coarser levels are a subset. A new hierarchy is written beside the
+dataset and moved into place when it is complete, so that a killed run leaves the dataset as it was.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from crashkit.errors import DataError, OutputError, ReadError
+from crashkit.mesh.levels import Hierarchy, Level
+from crashkit.mesh.lifting import LiftingError, LiftingMeter
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# Bytes of displacement held at once while streaming.
+_BUDGET = 128 << 20
+
+
+def write_hierarchy(
+    path: str | Path, hierarchy: Hierarchy, *, progress: Callable[[int, int], None] | None = None
+) -> list[LiftingError]:
+    """Write `hierarchy` into the dataset at `path` and return the lifting error of each level over all runs.
+
+    The displacements are read once, a block of states at a time; `progress(runs done, runs)` is called after each
+    run. An older hierarchy is replaced when the new one is complete.
+
+    Raises DataError if the hierarchy is not one of this dataset's mesh, OutputError if `path` cannot be written.
+    """
+    path = Path(path)
+    with open_root(path) as dataset:
+        if dataset.sizes["node"] != hierarchy.n_nodes:
+            raise DataError(
+                f"{path}: has {dataset.sizes['node']} nodes, the hierarchy was made for {hierarchy.n_nodes}; coarsen this dataset"
+            )
+        about = {
+            "settings": json.dumps(hierarchy.settings, default=_plain),
+            "mesh_checksum": mesh_checksum(dataset),
+            "dataset_checksum": str(dataset.attrs.get("checksum", "")),
+            "runs": json.dumps([str(s) for s in dataset["sim"].values]),
+            "levels": len(hierarchy.levels),
+        }
+        try:
+            with _target(path) as target:
+                target.group("hierarchy", about)
+                errors = _stream(dataset, hierarchy, target, progress)
+                for level, error in zip(hierarchy.levels, errors, strict=True):
+                    _write_level(target, level, error)
+        except OSError as error:
+            raise OutputError(
+                f"{path}: the hierarchy cannot be written ({error.strerror or error}); check permissions and free space"
+            ) from error
+    return errors
+
+
+def read_hierarchy(path: str | Path) -> Hierarchy:
+    """The hierarchy stored in the dataset at `path`.
+
+    Raises DataError if there is none or it belongs to another mesh, ReadError if it is damaged.
+    """
+    path = Path(path)
+    about = _about(path)
+    levels = []
+    n_finer = n_full = about["nodes"]
+    for index in range(1, int(about["levels"]) + 1):
+        with _open_level(path, index) as group:
+            try:
+                level = Level(
+                    index=index,
+                    kept=group["kept"].values.astype(np.int64),
+                    faces=group["faces"].values.astype(np.int32),
+                    edges=group["edges"].values.astype(np.int32),
+                    in_finer=group["in_finer"].values.astype(np.int64),
+                    to_finer=_csr(group, "to_finer", n_finer, group.sizes["level_node"]),
+                    to_full=_csr(group, "to_full", n_full, group.sizes["level_node"]),
+                    distance=group["distance"].values.astype(np.float64),
+                )
+            except (KeyError, ValueError) as error:
+                raise ReadError(
+                    f"{path}: /hierarchy/level_{index} is damaged ({error}); run crashkit coarsen again"
+                ) from error
+        levels.append(level)
+        n_finer = level.n_nodes
+    return Hierarchy(n_full, tuple(levels), json.loads(about["settings"]))
+
+
+def level_displacement(path: str | Path, level: int, runs: Sequence[int] | None = None) -> NDArray[np.float32]:
+    """Displacements (sim, time, node of `level`, 3), m, of the runs numbered `runs` (all without), level >= 1.
+
+    Only the displacements of level 1 are on disk; coarser levels are a subset of them. The fine field is not read.
+    """
+    path = Path(path)
+    about = _about(path)
+    if not 1 <= level <= int(about["levels"]):
+        raise DataError(f"{path}: level {level} was asked for; the hierarchy has levels 1 to {about['levels']}")
+    chosen = None
+    for index in range(2, level + 1):
+        with _open_level(path, index) as group:
+            places = group["in_finer"].values
+        chosen = places if chosen is None else chosen[places]
+    with _open_level(path, 1) as group:
+        stored = group["displacement"]
+        which = range(stored.sizes["sim"]) if runs is None else runs
+        nodes = stored.sizes["level_node"] if chosen is None else len(chosen)
+        out = np.empty((len(which), stored.sizes["time"], nodes, 3), np.float32)
+        for k, run in enumerate(which):
+            block = stored.isel(sim=int(run)).values
+            out[k] = block if chosen is None else block[:, chosen]
+    return out
+
+
+def summarize_hierarchy(path: str | Path) -> list[dict[str, float | int]]:
+    """For each level: level, nodes, faces, edges, mean and largest distance (m), mean and largest lifting error (m)."""
+    path = Path(path)
+    rows = []
+    for index in range(1, int(_about(path)["levels"]) + 1):
+        with _open_level(path, index) as group:
+            distance = group["distance"].values
+            rows.append(
+                {
+                    "level": index,
+                    "nodes": int(group.sizes["level_node"]),
+                    "faces": int(group.sizes.get("level_face", 0)),
+                    "edges": int(group.sizes.get("level_edge", 0)),
+                    "distance_mean": float(distance.mean()),
+                    "distance_max": float(distance.max()),
+                    "lifting_error_mean": float(group.attrs["lifting_error_mean"]),
+                    "lifting_error_max": float(group.attrs["lifting_error_max"]),
+                }
+            )
+    return rows
+
+
+def mesh_checksum(dataset: xr.Dataset) -> str:
+    """SHA-256 of the reference positions and faces: what a hierarchy depends on."""
+    digest = hashlib.sha256()
+    digest.update(np.ascontiguousarray(dataset["reference_position"].values, dtype="<f8").tobytes())
+    digest.update(np.ascontiguousarray(dataset["face_nodes"].values, dtype="<i8").tobytes())
+    return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class MeshArrays:
+    """What a hierarchy is built from: position (n, 3) float64, m; face_nodes (m, 3 or 4), face_part (m,)."""
+
+    position: NDArray[np.float64]
+    face_nodes: NDArray[np.integer]
+    face_part: NDArray[np.integer]
+
+
+def open_mesh(path: Path) -> MeshArrays:
+    """The mesh of the dataset at `path`; where the runs differ in shape, the one of the first run.
+
+    Raises ReadError if the file is no dataset, DataError if it holds no mesh.
+    """
+    with open_root(path) as dataset:
+        missing = [n for n in ("reference_position", "face_nodes", "displacement") if n not in dataset]
+        if missing:
+            raise DataError(
+                f"{path}: has no {missing[0]}; a mesh hierarchy needs a crash dataset with faces, made by crashkit ingest"
+            )
+        at = dataset["reference_position"]
+        if "sim" in at.dims:
+            at = at.isel(sim=0)
+        faces = dataset["face_nodes"].values
+        part = dataset["face_part"].values if "face_part" in dataset else np.zeros(len(faces), np.int32)
+        return MeshArrays(np.asarray(at.values, np.float64), faces, part)
+
+
+@contextmanager
+def open_root(path: Path, group: str | None = None) -> Iterator[xr.Dataset]:
+    """The dataset (or one group of it) at `path`, closed afterwards."""
+    import xarray as xr
+
+    if not path.exists():
+        raise ReadError(f"{path}: not found; expected a dataset made by crashkit ingest (.zarr or .nc)")
+    options: dict[str, Any] = {"engine": "zarr", "consolidated": False} if path.is_dir() else {"engine": "netcdf4"}
+    try:
+        dataset = xr.open_dataset(path, group=group, **options)
+    except KeyError:
+        raise
+    except Exception as error:  # what a damaged file raises is up to the libraries below
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise ReadError(f"{path}: cannot be opened as a crash dataset ({text[:200]})") from error
+    with dataset:
+        yield dataset
+
+
+@contextmanager
+def _open_level(path: Path, index: int) -> Iterator[xr.Dataset]:
+    with open_root(path, f"hierarchy/level_{index}") as group:
+        yield group
+
+
+def _about(path: Path) -> dict[str, Any]:
+    """Attributes of /hierarchy, checked against the dataset around it; `nodes` is added."""
+    with open_root(path) as dataset:
+        try:
+            with open_root(path, "hierarchy") as group:
+                about = dict(group.attrs)
+        except (ReadError, KeyError, OSError):
+            about = {}
+        if "levels" not in about:
+            raise DataError(f"{path}: has no mesh hierarchy; run crashkit coarsen {path} first")
+        if about["mesh_checksum"] != mesh_checksum(dataset):
+            raise DataError(f"{path}: its mesh hierarchy belongs to another mesh; run crashkit coarsen {path} again")
+        runs = [str(s) for s in dataset["sim"].values]
+        if json.loads(about["runs"]) != runs or about["dataset_checksum"] != str(dataset.attrs.get("checksum", "")):
+            raise DataError(f"{path}: its mesh hierarchy was made with other runs; run crashkit coarsen {path} again")
+        about["nodes"] = dataset.sizes["node"]
+    return about
+
+
+def _stream(
+    dataset: xr.Dataset, hierarchy: Hierarchy, target: _Target, progress: Callable[[int, int], None] | None
+) -> list[LiftingError]:
+    """One pass over the fine field: the displacements of level 1 go out, lifting errors add up."""
+    from crashkit.readers.base import split_states
+
+    meter = LiftingMeter(hierarchy)
+    first = hierarchy.levels[0]
+    runs, states = dataset.sizes["sim"], dataset.sizes["time"]
+    write = target.stream(
+        "hierarchy/level_1", "displacement", ("sim", "time", "level_node", "xyz"), (runs, states, first.n_nodes, 3),
+        {"units": "m", "long_name": "displacement of the nodes of level 1"},
+    )  # fmt: skip
+    for run in range(runs):
+        for begin, end in split_states(states, hierarchy.n_nodes, _BUDGET):
+            block = dataset["displacement"].isel(sim=run, time=slice(begin, end)).values
+            meter.add(block)
+            write(run, begin, end, block[:, first.kept].astype(np.float32))
+        if progress:
+            progress(run + 1, runs)
+    return meter.errors
+
+
+def _write_level(target: _Target, level: Level, error: LiftingError) -> None:
+    group = f"hierarchy/level_{level.index}"
+    target.group(
+        group,
+        {
+            "level": level.index,
+            "nodes": level.n_nodes,
+            "lifting_error_mean": error.mean,
+            "lifting_error_max": error.largest,
+            "lifting_error_units": "m",
+        },
+    )
+    target.array(group, "kept", ("level_node",), level.kept, {"long_name": "node of level 0"})
+    target.array(
+        group, "faces", ("level_face", "level_corner"), level.faces, {"long_name": "triangles, nodes of this level"}
+    )
+    target.array(
+        group, "edges", ("level_edge", "level_end"), level.edges, {"long_name": "graph edges, nodes of this level"}
+    )
+    target.array(
+        group, "in_finer", ("level_node",), level.in_finer, {"long_name": "place among the nodes of the finer level"}
+    )
+    target.array(
+        group, "distance", ("node",), level.distance, {"units": "m", "long_name": "distance to the coarse surface"}
+    )
+    for name, matrix in (("adjacency", level.adjacency), ("to_finer", level.to_finer), ("to_full", level.to_full)):
+        target.array(group, f"{name}_indptr", (f"{name}_row",), matrix.indptr.astype(np.int64), {})
+        target.array(group, f"{name}_indices", (f"{name}_entry",), matrix.indices.astype(np.int32), {})
+        if name != "adjacency":
+            target.array(group, f"{name}_data", (f"{name}_entry",), matrix.data, {})
+
+
+def _csr(group: xr.Dataset, name: str, rows: int, columns: int) -> sparse.csr_matrix:
+    matrix = sparse.csr_matrix(
+        (group[f"{name}_data"].values, group[f"{name}_indices"].values, group[f"{name}_indptr"].values),
+        shape=(rows, columns),
+    )
+    matrix.check_format(full_check=True)
+    return matrix
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+class _Target(Protocol):
+    """Where groups are written: beside the dataset until everything is there."""
+
+    def group(self, name: str, attributes: dict[str, Any]) -> None: ...
+
+    def array(
+        self, group: str, name: str, dims: tuple[str, ...], values: NDArray, attributes: dict[str, Any]
+    ) -> None: ...
+
+    def stream(
+        self, group: str, name: str, dims: tuple[str, ...], shape: tuple[int, ...], attributes: dict[str, Any]
+    ) -> Callable[[int, int, int, NDArray], None]:
+        """A function that writes (run, first state, last state + 1, block)."""
+        ...
+
+
+class _ZarrTarget:
+    def __init__(self, folder: Path) -> None:
+        import zarr
+
+        self._root = zarr.open_group(str(folder), mode="w")
+
+    def group(self, name: str, attributes: dict[str, Any]) -> None:
+        self._root.require_group(name).attrs.update(attributes)
+
+    def array(self, group: str, name: str, dims: tuple[str, ...], values: NDArray, attributes: dict[str, Any]) -> None:
+        array = self._root.require_group(group).create_array(
+            name, data=np.ascontiguousarray(values), dimension_names=dims
+        )
+        array.attrs.update(attributes)
+
+    def stream(
+        self, group: str, name: str, dims: tuple[str, ...], shape: tuple[int, ...], attributes: dict[str, Any]
+    ) -> Callable[[int, int, int, NDArray], None]:
+        array = self._root.require_group(group).create_array(
+            name, shape=shape, chunks=(1, *shape[1:]), dtype="float32", fill_value=np.nan, dimension_names=dims
+        )
+        array.attrs.update(attributes)
+
+        def write(run: int, begin: int, end: int, block: NDArray) -> None:
+            array[run, begin:end] = block
+
+        return write
+
+
+class _NetcdfTarget:
+    def __init__(self, file: Path) -> None:
+        import netCDF4
+
+        self._root = netCDF4.Dataset(str(file), "a")
+
+    def close(self) -> None:
+        self._root.close()
+
+    def group(self, name: str, attributes: dict[str, Any]) -> None:
+        self._root.createGroup(name).setncatts(attributes)
+
+    def array(self, group: str, name: str, dims: tuple[str, ...], values: NDArray, attributes: dict[str, Any]) -> None:
+        self._variable(group, name, dims, values.shape, values.dtype, attributes)[...] = values
+
+    def stream(
+        self, group: str, name: str, dims: tuple[str, ...], shape: tuple[int, ...], attributes: dict[str, Any]
+    ) -> Callable[[int, int, int, NDArray], None]:
+        variable = self._variable(group, name, dims, shape, np.dtype(np.float32), attributes, (1, *shape[1:]))
+
+        def write(run: int, begin: int, end: int, block: NDArray) -> None:
+            variable[run, begin:end] = block
+
+        return write
+
+    def _variable(self, group, name, dims, shape, dtype, attributes, chunks=None):  # type: ignore[no-untyped-def]
+        home = self._root.createGroup(group)
+        for dim, size in zip(dims, shape, strict=True):
+            if dim not in home.dimensions and dim not in self._root.dimensions:
+                home.createDimension(dim, size)
+        options: dict[str, Any] = {"fill_value": np.nan} if dtype.kind == "f" else {}
+        variable = home.createVariable(name, dtype, dims, compression="zlib", complevel=1, chunksizes=chunks, **options)
+        variable.setncatts(attributes)
+        return variable
+
+
+@contextmanager
+def _target(path: Path) -> Iterator[_Target]:
+    """Somewhere to write /hierarchy; taken over into the dataset at the end, thrown away on failure."""
+    beside = path.with_name(f".{path.name}.coarsen")
+    _remove(beside)
+    try:
+        if path.is_dir():
+            yield _ZarrTarget(beside)
+            _move_zarr_group(beside / "hierarchy", path)
+        else:
+            _copy_without_hierarchy(path, beside)
+            target = _NetcdfTarget(beside)
+            try:
+                yield target
+            finally:
+                target.close()
+            os.replace(beside, path)
+    finally:
+        _remove(beside)
+
+
+def _move_zarr_group(group: Path, path: Path) -> None:
+    import zarr
+
+    home, old = path / "hierarchy", group.with_name("replaced")
+    if home.exists():
+        home.rename(old)
+    group.rename(home)
+    if zarr.open_group(str(path), mode="r").metadata.consolidated_metadata is not None:
+        with warnings.catch_warnings():
+            # Zarr warns that version 3 does not specify what xarray has put there already.
+            warnings.simplefilter("ignore")
+            zarr.consolidate_metadata(str(path))
+
+
+def _copy_without_hierarchy(path: Path, copy: Path) -> None:
+    """A copy of a NetCDF file; HDF5 gives no space back, so an older hierarchy is left out by copying around it."""
+    import netCDF4
+
+    with netCDF4.Dataset(str(path)) as source:
+        if "hierarchy" in source.groups:
+            with netCDF4.Dataset(str(copy), "w") as target:
+                _copy_netcdf(source, target, leave_out="hierarchy")
+            return
+    shutil.copyfile(path, copy)
+
+
+def _copy_netcdf(source: Any, target: Any, leave_out: str = "") -> None:
+    target.setncatts({name: source.getncattr(name) for name in source.ncattrs()})
+    for name, dim in source.dimensions.items():
+        target.createDimension(name, None if dim.isunlimited() else len(dim))
+    for name, variable in source.variables.items():
+        attributes = {k: variable.getncattr(k) for k in variable.ncattrs()}
+        chunks = variable.chunking()
+        filters = variable.filters() or {}
+        options: dict[str, Any] = {"zlib": True, "complevel": filters["complevel"]} if filters.get("zlib") else {}
+        options |= {"shuffle": bool(filters.get("shuffle"))} if options else {}
+        new = target.createVariable(
+            name, variable.dtype, variable.dimensions, fill_value=attributes.pop("_FillValue", None),
+            chunksizes=None if chunks == "contiguous" or not variable.dimensions else chunks, **options,
+        )  # fmt: skip
+        new.setncatts(attributes)
+        variable.set_auto_maskandscale(False)
+        new.set_auto_maskandscale(False)
+        if variable.ndim > 1 and variable.dtype is not str:
+            for row in range(variable.shape[0]):
+                new[row] = variable[row]
+        else:
+            new[...] = variable[...]
+    for name, group in source.groups.items():
+        if name != leave_out:
+            _copy_netcdf(group, target.createGroup(name))
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
