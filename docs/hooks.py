@@ -1,0 +1,46 @@
+"""Fills the schema tables of the documentation from the code, so that they cannot drift apart."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Replace `<!-- schema: dimensions|variables|attributes -->` by tables."""
+    for name, make in (("dimensions", _dimensions), ("variables", _variables), ("attributes", _attributes)):
+        marker = f"<!-- schema: {name} -->"
+        if marker in markdown:
+            markdown = markdown.replace(marker, make())
+    return markdown
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    lines = [head, tuple("---" for _ in head), *rows]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in lines)
+
+
+def _dimensions() -> str:
+    from data_schema import DIMENSIONS
+
+    return _table(("dimension", "meaning"), [(f"`{k}`", v) for k, v in DIMENSIONS.items()])
+
+
+def _variables() -> str:
+    from data_schema import VARIABLES
+
+    return _table(
+        ("name", "dimensions", "unit", "required", "meaning"),
+        [
+            (f"`{v.name}`", " or ".join(", ".join(d) for d in v.dims), v.unit or "-", "yes" if v.required else "", v.meaning)
+            for v in VARIABLES.values()
+        ],
+    )
+
+
+def _attributes() -> str:
+    from data_schema import ATTRIBUTES
+
+    return _table(
+        ("attribute", "required", "meaning"),
+        [(f"`{a.name}`", "yes" if a.required else "", a.meaning) for a in ATTRIBUTES.values()],
+    )
