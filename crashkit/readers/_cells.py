@@ -15,11 +15,11 @@ _HEXAHEDRON_FACES = ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2,
 
 
 def shell_faces(nodes: NDArray[np.integer]) -> NDArray[np.int32]:
-    """Quadrilaterals (face, 4), some with a repeated corner, as (face, 4) with -1 last in triangles, or (face, 3).
+    """Faces (face, 3 or 4), some with a repeated corner, with -1 last in triangles; (face, 3) if all are triangles.
 
     A facet with fewer than three different corners is left as it is.
     """
-    faces = np.array(nodes, np.int32).reshape(len(nodes), -1)
+    faces = np.array(nodes, np.int32)
     if faces.shape[1] == 3:
         return faces
     following = np.roll(faces, -1, axis=1)
@@ -38,16 +38,16 @@ def solid_cells(nodes: NDArray[np.integer]) -> tuple[NDArray[np.int32], NDArray[
     Tetrahedra, pyramids and wedges are found by which corners coincide, and keep their orientation. Anything else
     (two coinciding corners, say) stays a hexahedron with repeated nodes.
     """
-    nodes = np.asarray(nodes, np.int32).reshape(len(nodes), 8)
-    cells, types = nodes.copy(), np.full(len(nodes), HEXAHEDRON, np.uint8)
+    hexahedra: NDArray[np.int32] = np.asarray(nodes, np.int32)
+    cells, types = hexahedra.copy(), np.full(len(hexahedra), HEXAHEDRON, np.uint8)
     # Every corner's first corner with the same node: few different patterns, each worked out once.
-    pattern = (nodes[:, :, None] == nodes[:, None, :]).argmax(axis=2)
-    for same in np.unique(pattern, axis=0) if len(nodes) else ():
+    pattern = (hexahedra[:, :, None] == hexahedra[:, None, :]).argmax(axis=2)
+    for same in np.unique(pattern, axis=0) if len(hexahedra) else ():
         kind, corners = _collapsed(tuple(int(c) for c in same))
         if kind != HEXAHEDRON:
             rows = (pattern == same).all(axis=1)
             cells[rows] = -1
-            cells[rows, : len(corners)] = nodes[rows][:, list(corners)]
+            cells[rows, : len(corners)] = hexahedra[rows][:, list(corners)]
             types[rows] = kind
     return cells, types
 

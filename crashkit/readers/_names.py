@@ -46,6 +46,8 @@ _SAME = {
     "velocities": "velocity",
     "accelerations": "acceleration",
 }
+# A part so called is a rigid wall drawn for the eye, where nothing better tells it.
+WALL_NAME = re.compile(r"\brigid.?wall|\brwall", re.IGNORECASE)
 DISPLACEMENT_NAMES = ("displacement", "displacements", "displ", "disp", "u")
 
 

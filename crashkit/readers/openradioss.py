@@ -27,12 +27,11 @@ from crashkit.readers import _radioss_deck as deck
 from crashkit.readers import register
 from crashkit.readers._cells import LINE, VERTEX, shell_faces, solid_cells, stack_cells
 from crashkit.readers._checks import EachRun, require_finite, require_indices, require_options, time_problems
-from crashkit.readers._names import DISPLACEMENT_NAMES, field_name, quantity
+from crashkit.readers._names import DISPLACEMENT_NAMES, WALL_NAME, field_name, quantity
 from crashkit.readers._radioss_file import Array, Content, beginning, read_layout, starts_well
 from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh
 
 _FILE = re.compile(r"(?P<root>.+)A(?P<number>\d{3,4})(?:\.gz)?")
-_WALL_NAME = re.compile(r"\brigid.?wall|\brwall", re.IGNORECASE)
 # Unpacked gzip files are kept up to this many bytes, so that a state's fields need not unpack it again.
 _CACHE = 64 << 20
 
@@ -184,7 +183,7 @@ class _RadiossRun(Run):
                 elif numbered:
                     wall = not ids[kind][ours].any() and not node_id[nodes[ours]].any()
                 else:
-                    wall = _WALL_NAME.search(text) is not None
+                    wall = WALL_NAME.search(text) is not None
                 parts.append(_part(text, len(parts) + 1, wall))
         cells, types = [], []
         for kind in self._cell_kinds:

@@ -1,0 +1,322 @@
+"""What stands where in an LS-DYNA d3plot family, and its sections, parsed by lasso-python.
+
+lasso-python loads the whole first file and parses the mesh anew for every slice of states, believes every count in
+the header, and prints failures to stderr and goes on. So the counts are checked against the file's size here before
+lasso-python sees them, it gets the geometry section once and then single blocks of single states, and a failure it
+swallowed becomes a ReadError.
+
+A file of the family holds whole states, then the word -999999.0, then zeros up to a multiple of 512 words. The
+first file holds the geometry before its states, usually without any.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crashkit.errors import ReadError
+
+_END = -999999.0
+_HEADER_WORDS = 64
+# More than this is read of the first file only where its header asks for it (part titles, rigid bodies).
+_SLACK = 32 << 20
+_D3PLOT, _D3PART = 1, 5
+# Words of the header that are counts, by the names of LS-DYNA's database manual.
+_COUNTS = (
+    "numnp", "nglbv", "nummat8", "nv3d", "nel2", "nummat2", "nv1d", "nel4", "nummat4", "nv2d", "neiph", "neips",
+    "nmsph", "ngpsph", "narbs", "nelt", "nummatt", "nv3dt", "ialemat", "nmmat", "npefg", "nel48", "extra",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class StateAt:
+    """Where one state begins."""
+
+    file: Path
+    offset: int
+
+
+def word_size(file: Path) -> int | None:
+    """4 or 8 where the file begins like a d3plot in single or double precision, else None."""
+    with file.open("rb") as stream:
+        head = stream.read(_HEADER_WORDS * 8)
+    for size, kind in ((4, "<i4"), (8, "<i8")):
+        if len(head) < _HEADER_WORDS * size:
+            continue
+        words = np.frombuffer(head[: _HEADER_WORDS * size], kind)
+        kinds, dimensions, nodes, code = (int(words[k]) for k in (11, 15, 16, 17))
+        if kinds % 1000 in (_D3PLOT, _D3PART) and 2 <= dimensions <= 9 and nodes > 0 and code in (2, 6):
+            return size
+    return None
+
+
+class D3plotFile:
+    """One family: header, geometry arrays and the places of all states.
+
+    `header` is lasso-python's, `arrays` its geometry arrays by its names, `states` the places of the whole states,
+    `problems` why there may be fewer of them than were computed.
+    """
+
+    def __init__(self, first: Path, rest: tuple[Path, ...]) -> None:
+        self.first = first
+        size = first.stat().st_size
+        word = word_size(first)
+        if word is None:
+            raise ReadError(f"{first}: does not begin like a d3plot ({size} bytes); it is something else or damaged")
+        self._word = word
+        need = self._check_header(size)
+        with first.open("rb") as stream:
+            geometry = stream.read(2 * need + _SLACK)
+        with _lasso_guard(first):
+            self._lasso = _lasso_class()(geometry)
+        self.header = self._lasso.header
+        self.arrays: dict[str, Any] = dict(self._lasso.arrays)
+        self._lasso.arrays = {}
+        self.state_bytes = int(self._lasso._compute_n_bytes_per_state())
+        end = int(self._lasso.geometry_section_size)
+        if end > size or self.state_bytes < word:
+            raise ReadError(
+                f"{first}: its mesh should end at byte {end} of {size} and its states take {self.state_bytes} bytes; "
+                "the file is damaged, copy it again"
+            )
+        self.blocks = self._place_blocks()
+        self.states: list[StateAt] = []
+        self.problems: list[str] = []
+        self._find_states(first, end, geometry=True)
+        for file in rest:
+            self._find_states(file, 0, geometry=False)
+
+    def _check_header(self, size: int) -> int:
+        """Bytes that the header's counts ask for. Raises ReadError where they cannot be true."""
+        from lasso.dyna.d3plot_header import D3plotHeader
+
+        with _lasso_guard(self.first):
+            header = D3plotHeader(str(self.first))
+        words = header.raw_header
+        for name in _COUNTS:
+            if words.get(name, 0) < 0:
+                raise ReadError(
+                    f"{self.first}: word {name.upper()} of the header is {words[name]}; the file is damaged"
+                )
+        if header.has_femzip_indicator:
+            raise ReadError(f"{self.first}: is packed with FEMZIP, which needs a licence to read; unpack it first")
+        if words["ndim"] == 2:
+            raise ReadError(f"{self.first}: holds a 2-D model; only 3-D models are read")
+        if words["nel8"] < 0:
+            raise ReadError(f"{self.first}: holds ten-node solids (NEL8 = {words['nel8']}), which are not read")
+        need = self._word * (
+            _HEADER_WORDS
+            + words["extra"]
+            + 3 * words["numnp"]
+            + 9 * (words["nel8"] + words["nelt"])
+            + 6 * words["nel2"]
+            + 5 * (words["nel4"] + words["nel48"])
+            + words["narbs"]
+            + 2 * words["nmsph"]
+            + words["ialemat"]
+        )
+        if need > size:
+            raise ReadError(
+                f"{self.first}: its header asks for {need} bytes of mesh ({words['numnp']} nodes, "
+                f"{words['nel4']} shells, {words['nel8']} solids), the file has {size}; "
+                "it is cut short or damaged, copy it again"
+            )
+        return need
+
+    def _place_blocks(self) -> dict[str, tuple[int, int]]:
+        """Name -> (first word, words) of the blocks of one state, in the order of LS-DYNA's database manual."""
+        h = self.header
+        rigid = self._lasso._material_section_info.n_rigid_shells
+        shells = h.n_shells - rigid if h.filetype.value == _D3PLOT else h.n_shells
+        nodal = {
+            "displacement": 3 * h.has_node_displacement,
+            "temperature": (3 if h.has_node_temperature_layers else 1) * h.has_node_temperatures,
+            "heat_flux": 3 * h.has_node_heat_flux,
+            "mass_scaling": h.has_node_mass_scaling,
+            "temperature_gradient": h.has_node_temperature_gradient,
+            "residual": 3 * h.has_node_residual_forces + 3 * h.has_node_residual_moments,
+            "velocity": 3 * h.has_node_velocity,
+            "acceleration": 3 * h.has_node_acceleration,
+        }
+        lengths = {
+            "time": 1,
+            "global": h.n_global_vars,
+            **{name: width * h.n_nodes for name, width in nodal.items()},
+            "thermal": h.n_solids * h.n_solid_thermal_vars,
+            "solid": h.n_solids * h.n_solid_vars,
+            "tshell": h.n_thick_shells * h.n_thick_shell_vars,
+            "beam": h.n_beams * h.n_beam_vars,
+            "shell": shells * h.n_shell_vars,
+        }
+        if h.has_node_deletion_data:
+            lengths["node_alive"] = h.n_nodes
+        elif h.has_element_deletion_data:
+            counts = (h.n_solids, h.n_thick_shells, h.n_shells, h.n_beams)
+            for kind, count in zip(("solid", "tshell", "shell", "beam"), counts, strict=True):
+                lengths[f"{kind}_alive"] = count
+        blocks, start = {}, 0
+        for name, length in lengths.items():
+            blocks[name] = (start, int(length))
+            start += int(length)
+        if start * self._word > self.state_bytes:
+            raise ReadError(
+                f"{self.first}: the variables its header names take {start * self._word} bytes a state, "
+                f"the states {self.state_bytes}; the file is damaged"
+            )
+        return blocks
+
+    def _find_states(self, file: Path, start: int, *, geometry: bool) -> None:
+        """Add the whole states of `file`, and a problem where something else than an end mark follows them."""
+        size = file.stat().st_size
+        content = _content_end(file, start)
+        count, rest = divmod(max(0, content - start), self.state_bytes)
+        self.states += [StateAt(file, start + k * self.state_bytes) for k in range(count)]
+        if geometry and count == 0 and rest == 0:
+            return  # the geometry's own end mark stands before `start`
+        place = start + count * self.state_bytes
+        if rest != self._word or self._word_at(file, place) != _END:
+            whole = f"behind {count} whole state{'s' if count != 1 else ''} of {self.state_bytes} bytes"
+            self.problems.append(
+                f"{file}: {whole}, at byte {place} of {size}, stands no end mark but {rest} bytes more; "
+                "it is cut short or damaged, or the solver was stopped while writing"
+            )
+
+    def _word_at(self, file: Path, offset: int) -> float:
+        with file.open("rb") as stream:
+            stream.seek(offset)
+            found = stream.read(self._word)
+        return float(np.frombuffer(found, self.header.ftype)[0]) if len(found) == self._word else 0.0
+
+    def block(self, name: str, state: int) -> NDArray[Any]:
+        """The words of block `name` of one state, (n,) float."""
+        at = self.states[state]
+        first, length = self.blocks[name]
+        with at.file.open("rb") as stream:
+            stream.seek(at.offset + first * self._word)
+            found = stream.read(length * self._word)
+        if len(found) != length * self._word:
+            raise ReadError(
+                f"{at.file}: ends at byte {at.offset + first * self._word + len(found)}, within state {state}"
+            )
+        return np.frombuffer(found, self.header.ftype)
+
+    def elements(self, kind: str, state: int) -> dict[str, NDArray[Any]]:
+        """Element results of one state by lasso-python's names, (1, element, ...); `kind` as the block is called."""
+        read = {"solid": "solids", "tshell": "tshell", "beam": "beams", "shell": "shell"}[kind]
+        found: dict[str, NDArray[Any]] = {}
+        with _lasso_guard(self.states[state].file):
+            getattr(self._lasso, f"_read_states_{read}")(self.block(kind, state)[None], 0, found)
+        return found
+
+
+def _content_end(file: Path, start: int) -> int:
+    """Byte behind the last one that is not zero, but not before `start`; the padding is short, so from the rear."""
+    with file.open("rb") as stream:
+        end = stream.seek(0, 2)
+        while end > start:
+            begin = max(start, end - (1 << 16))
+            stream.seek(begin)
+            filled = np.flatnonzero(np.frombuffer(stream.read(end - begin), np.uint8))
+            if len(filled):
+                return begin + int(filled[-1]) + 1
+            end = begin
+    return start
+
+
+@cache
+def _lasso_class() -> Any:
+    """lasso-python's D3plot for a geometry section in memory, with its loops bounded."""
+    from lasso.dyna import D3plot
+    from lasso.io.binary_buffer import BinaryBuffer
+
+    class Geometry(D3plot):
+        def __init__(self, content: bytes) -> None:
+            super().__init__()
+            self._buffer = BinaryBuffer()
+            self._buffer.memoryview = memoryview(content)
+            self._read_header()
+            self._parse_geometry()
+            self._buffer = None
+
+        def _bound(self, what: str, place: int, limit: int) -> None:
+            """lasso-python loops over counts from the file; a count that cannot be true is refused."""
+            at = self.geometry_section_size + place * self.header.wordsize
+            count = int(self._buffer.read_number(at, self.header.itype))
+            if not 0 <= count <= limit:
+                raise ValueError(f"{count} {what}, expected at most {limit}")
+
+        def _read_particle_data(self) -> None:
+            if self._buffer and 0 < self.header.raw_header["npefg"] <= 10_000_000:
+                for place in (0, 1, 3):
+                    self._bound("airbag variables", place, 10_000)
+                self._bound("airbag particles", 2, 1 << 28)
+            super()._read_particle_data()
+
+        def _read_rigid_body_description(self) -> None:
+            if self._buffer and self.header.has_rigid_body_data:
+                self._bound("rigid bodies", 0, self.header.n_parts)
+            super()._read_rigid_body_description()
+
+        def _read_rigid_road_surface(self) -> None:
+            if self._buffer and self.header.has_rigid_road_surface:
+                for place, what in enumerate(("road nodes", "road segments", "road surfaces")):
+                    self._bound(what, place, len(self._buffer) // self.header.wordsize)
+            super()._read_rigid_road_surface()
+
+    return Geometry
+
+
+class _Swallowed(logging.Handler):
+    """Keeps what lasso-python logs instead of raising, for the thread that it was logged in."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.found = threading.local()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            text = record.getMessage()
+        except (TypeError, ValueError):  # some of its messages do not fit their arguments
+            text = str(record.msg)
+        self.found.__dict__.setdefault("messages", []).append(text)
+
+
+@cache
+def _swallowed() -> _Swallowed:
+    # lasso-python configures the root logger when imported; that is for the application to do.
+    root = logging.getLogger()
+    before = list(root.handlers)
+    from lasso.dyna import d3plot, d3plot_header
+
+    for handler in [h for h in root.handlers if h not in before]:
+        root.removeHandler(handler)
+    keeper = _Swallowed()
+    for logger in (d3plot.LOGGER, d3plot_header.LOGGER):
+        logger.addHandler(keeper)
+        logger.propagate = False
+    return keeper
+
+
+@contextmanager
+def _lasso_guard(file: Path) -> Iterator[None]:
+    """What lasso-python raises or logs becomes a ReadError."""
+    keeper = _swallowed()
+    keeper.found.messages = []
+    try:
+        yield
+    except ReadError:
+        raise
+    except Exception as error:  # it raises whatever numpy or struct meet in its way
+        raise ReadError(f"{file}: not readable as d3plot ({error}); the file is damaged, copy it again") from error
+    for message in keeper.found.messages:
+        last = " ".join(message.strip().splitlines()[-1].split())
+        raise ReadError(f"{file}: not fully understood as d3plot ({last}); the file is damaged or of an unknown kind")

@@ -1,0 +1,380 @@
+"""LS-DYNA d3plot families: d3plot, d3plot01, .. d3plot99, d3plot100, read through lasso-python.
+
+The node block of a state holds current positions (IU = 1), whatever it is called elsewhere; a file whose first
+state is zero there holds displacements. Both become displacements from the geometry section's positions.
+
+Shells are faces; solids, thick shells, beams and particles are cells, in this order. Fields of shells and nodes
+stand alone (`plastic_strain`, `velocity`); those of cells carry their kind in front (`solid_plastic_strain`). Where
+an element has several integration points, `plastic_strain` and `von_mises` are the largest of them and `stress` and
+`strain` their mean (xx, yy, zz, xy, yz, zx). Shells of rigid parts have no results; their fields are NaN.
+
+A part is taken for a rigid wall if it is called so and, where the file tells materials, is rigid (material 20).
+
+A d3plot does not know its end time; it is taken from *CONTROL_TERMINATION of a keyword file in the same folder.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crashkit.errors import ReadError
+from crashkit.readers import register
+from crashkit.readers._cells import LINE, VERTEX, shell_faces, solid_cells, stack_cells
+from crashkit.readers._checks import EachRun, require_finite, require_indices, require_options, time_problems
+from crashkit.readers._d3plot_file import D3plotFile, word_size
+from crashkit.readers._names import WALL_NAME, quantity
+from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh
+
+_RIGID = 20
+_DECK_SUFFIXES = (".k", ".key", ".dyn")
+_DECK_BYTES = 16 << 20
+# (kind, field, lasso-python's name, components); what stands in a file is told by its header.
+_ELEMENT_FIELDS = (
+    ("solid", "stress", "element_solid_stress", 6),
+    ("solid", "von_mises", "element_solid_stress", 1),
+    ("solid", "plastic_strain", "element_solid_effective_plastic_strain", 1),
+    ("tshell", "stress", "element_tshell_stress", 6),
+    ("tshell", "von_mises", "element_tshell_stress", 1),
+    ("tshell", "plastic_strain", "element_tshell_effective_plastic_strain", 1),
+    ("beam", "axial_force", "element_beam_axial_force", 1),
+    ("beam", "shear_force", "element_beam_shear_force", 2),
+    ("shell", "stress", "element_shell_stress", 6),
+    ("shell", "von_mises", "element_shell_stress", 1),
+    ("shell", "plastic_strain", "element_shell_effective_plastic_strain", 1),
+    ("shell", "strain", "element_shell_strain", 6),
+    ("shell", "thickness", "element_shell_thickness", 1),
+)
+_CELL_KINDS = ("solid", "tshell", "beam", "sph")
+
+
+class D3plot:
+    """Reader of a d3plot (its first file), of a folder with one or several, or of a folder of such folders."""
+
+    name = "d3plot"
+    description = "LS-DYNA d3plot, d3plot01, ... (through lasso-python)"
+
+    def sniff(self, path: Path) -> bool:
+        try:
+            return bool(_first_files(path))
+        except OSError:
+            return False
+
+    def runs(self, path: Path, **options: object) -> Iterator[Run]:
+        require_options(self.name, options)
+        found = _first_files(path) or ({path.name: path} if path.is_file() else {})
+        if not found:
+            raise ReadError(f"{path}: no d3plot here; expected files d3plot, d3plot01, ...")
+        return EachRun([partial(_D3plotRun, name, file) for name, file in found.items()])
+
+
+def _first_files(path: Path) -> dict[str, Path]:
+    """Run name -> first file of all families at `path`."""
+    if path.is_file():
+        if word_size(path) is None:
+            return {}
+        alone = len(_first_files_in(path.parent)) <= 1
+        return {path.resolve().parent.name if alone else path.name: path}
+    if not path.is_dir():
+        return {}
+    families = {}
+    for folder in (path, *sorted(p for p in path.iterdir() if p.is_dir())):
+        found = _first_files_in(folder)
+        for file in found:
+            inside = file.name if folder is path else f"{folder.name}/{file.name}"
+            families[folder.resolve().name if len(found) == 1 else inside] = file
+    return families
+
+
+def _first_files_in(folder: Path) -> list[Path]:
+    files = sorted(p for p in folder.iterdir() if p.is_file())
+    names = {p.name for p in files}
+    likely = [p for p in files if p.name.lower().endswith("d3plot") or f"{p.name}01" in names]
+    return [p for p in likely if word_size(p) is not None]
+
+
+class _D3plotRun(Run):
+    """One family; the states' blocks are read when they are asked for."""
+
+    def __init__(self, name: str, first: Path) -> None:
+        self.name, self.solver = name, "LS-DYNA"
+        family = _family(first)
+        self._file = D3plotFile(first, tuple(family.values()))
+        if "displacement" not in self._file.blocks or not self._file.blocks["displacement"][1]:
+            found = [n for n in ("temperature", "velocity", "acceleration") if self._file.blocks[n][1]]
+            raise ReadError(
+                f"{first}: has no displacements (IU = 0), only {', '.join(found) or 'no node results'}; "
+                "let LS-DYNA write them (*DATABASE_EXTENT_BINARY), or leave this run out"
+            )
+        if not self._file.states:
+            raise ReadError(f"{first}: no state found in {1 + len(family)} file(s); {_reason(self._file.problems)}")
+        self._arrays = self._file.arrays
+        self.mesh = self._read_mesh()
+        self.time = np.array([self._file.block("time", k)[0] for k in range(len(self._file.states))], np.float64)
+        self._holds_positions = self._told_positions()
+        self.fields = self._offered()
+        self.parameters: Mapping[str, Parameter] = {}
+        decks = sorted(p for p in first.parent.iterdir() if p.suffix.lower() in _DECK_SUFFIXES and p.is_file())
+        self.end_time = _end_time(decks)
+        self.files = (first, *family.values())
+        self.problems = (
+            *_gaps(first, tuple(family)),
+            *_adapted(first),
+            *self._file.problems,
+            *time_problems(self.time, [self._place(k) for k in range(len(self.time))]),
+        )
+
+    def _place(self, state: int) -> str:
+        at = self._file.states[state]
+        return f"{at.file}, state {state}, byte {at.offset}"
+
+    # The mesh
+
+    def _array(self, name: str, length: int) -> NDArray[np.int64]:
+        found = np.asarray(self._arrays.get(name, np.arange(1, length + 1)), np.int64)
+        if len(found) != length:
+            raise ReadError(f"{self._file.first}: {name} has {len(found)} entries, expected {length}; it is damaged")
+        return found
+
+    def _read_mesh(self) -> RunMesh:
+        header, first = self._file.header, self._file.first
+        position = np.array(self._arrays["node_coordinates"], np.float64)
+        require_finite(position, "the position", f"{first}, geometry")
+        parts = self._parts()
+        owners: dict[str, NDArray[np.int64]] = {}
+        nodes: dict[str, NDArray[np.int64]] = {}
+        for kind, corners in (("solid", 8), ("tshell", 8), ("beam", 2), ("shell", 4)):
+            joined = np.asarray(self._arrays[f"element_{kind}_node_indexes"], np.int64)[:, :corners]
+            owners[kind] = np.asarray(self._arrays[f"element_{kind}_part_indexes"], np.int64)
+            nodes[kind] = joined
+        nodes["sph"] = np.asarray(self._arrays.get("sph_node_indexes", []), np.int64).reshape(-1, 1)
+        owners["sph"] = np.asarray(self._arrays.get("sph_node_material_index", []), np.int64)
+        for kind in nodes:
+            require_indices(nodes[kind], len(position), kind, f"{first}, geometry")
+            if owners[kind].size and not 0 <= owners[kind].min() <= owners[kind].max() < len(parts):
+                raise ReadError(
+                    f"{first}: a {kind} names part {int(owners[kind].max()) + 1} of {len(parts)}; the file is damaged"
+                )
+        self._counts = {kind: len(nodes[kind]) for kind in _CELL_KINDS}
+        cells, types = [], []
+        for kind in _CELL_KINDS:
+            if kind in ("solid", "tshell"):
+                shaped, shapes = solid_cells(nodes[kind])
+            else:
+                shaped = nodes[kind].astype(np.int32)
+                shapes = np.full(len(shaped), LINE if kind == "beam" else VERTEX, np.uint8)
+            cells.append(shaped)
+            types.append(shapes)
+        ids = [self._array(f"element_{k}_ids", self._counts[k]) for k in _CELL_KINDS if k != "sph"]
+        particles = self._array("node_ids", header.n_nodes)[nodes["sph"][:, 0]]
+        return RunMesh(
+            position=position,
+            node_id=self._array("node_ids", header.n_nodes),
+            face_nodes=shell_faces(nodes["shell"]),
+            face_part=owners["shell"].astype(np.int32),
+            face_id=self._array("element_shell_ids", len(nodes["shell"])),
+            parts=parts,
+            cell_nodes=stack_cells(cells),
+            cell_type=np.concatenate(types),
+            cell_part=np.concatenate([owners[k] for k in _CELL_KINDS]).astype(np.int32),
+            cell_id=np.concatenate([*ids, particles]),
+        )
+
+    def _parts(self) -> tuple[Part, ...]:
+        count = int(self._file.header.n_parts)
+        titled = np.asarray(self._arrays.get("part_titles_ids", []), np.int64)
+        if "part_ids" in self._arrays:
+            ids = self._array("part_ids", count)
+        else:
+            ids = titled if len(titled) == count else np.arange(1, count + 1)
+        titles = dict(zip(titled.tolist(), self._arrays.get("part_titles", ()), strict=True))
+        materials = np.asarray(self._arrays.get("part_material_type", []), np.int64)
+        parts = []
+        for k, number in enumerate(ids.tolist()):
+            name = bytes(titles.get(number, b"")).split(b"\0")[0].decode("latin-1").strip() or f"part {number}"
+            rigid = len(materials) != count or materials[k] == _RIGID
+            parts.append(Part(number, name, rigid and WALL_NAME.search(name) is not None))
+        return tuple(parts)
+
+    def _told_positions(self) -> bool:
+        """Whether the node block holds positions; else it holds displacements."""
+        first = self._file.block("displacement", 0)
+        size = float(np.ptp(self.mesh.position, axis=0).max(initial=0.0))
+        return not (np.abs(first).max(initial=0.0) < 1e-6 * size < np.abs(self.mesh.position).max(initial=0.0))
+
+    # States
+
+    def displacement(self, first: int, last: int) -> NDArray[np.float32]:
+        out = np.empty((last - first, len(self.mesh.position), 3), np.float32)
+        for row, state in enumerate(range(first, last)):
+            found = self._file.block("displacement", state).reshape(-1, 3)
+            require_finite(found, "the position", self._place(state))
+            out[row] = found - self.mesh.position if self._holds_positions else found
+        return out
+
+    def _offered(self) -> dict[str, FieldInfo]:
+        header, blocks = self._file.header, self._file.blocks
+        fields = {}
+        for name in ("velocity", "acceleration"):
+            if blocks[name][1]:
+                fields[name] = FieldInfo(name, "node", 3, name)
+        if blocks["temperature"][1] and not header.has_node_temperature_layers:
+            fields["temperature"] = FieldInfo("temperature", "node", 1, "temperature")
+        told = {
+            "stress": {"solid": header.has_solid_stress, "default": header.has_shell_tshell_stress},
+            "plastic_strain": {"solid": header.has_solid_pstrain, "default": header.has_shell_tshell_pstrain},
+            "strain": {"default": header.has_element_strain},
+            "thickness": {"default": header.has_shell_extra_variables},
+            "axial_force": {"default": header.n_beam_vars >= 6},
+            "shear_force": {"default": header.n_beam_vars >= 6},
+        }
+        for kind, plain, _, components in _ELEMENT_FIELDS:
+            there = told["stress" if plain == "von_mises" else plain]
+            if blocks[kind][1] and there.get(kind, there["default"]):
+                name = plain if kind == "shell" else f"{kind}_{plain}"
+                place = "face" if kind == "shell" else "cell"
+                fields[name] = FieldInfo(name, place, components, quantity(plain))  # type: ignore[arg-type]
+        return fields
+
+    def field(self, name: str, first: int, last: int) -> NDArray[np.float32]:
+        info = self.fields[name]
+        if info.location == "node":
+            values = np.stack([self._file.block(name, s) for s in range(first, last)]).astype(np.float32)
+            return values.reshape(last - first, -1, 3) if info.components == 3 else values
+        kind, plain, theirs = next(
+            (kind, plain, theirs)
+            for kind, plain, theirs, _ in _ELEMENT_FIELDS
+            if name == (plain if kind == "shell" else f"{kind}_{plain}")
+        )
+        found = []
+        for state in range(first, last):
+            arrays = self._file.elements(kind, state)
+            if theirs not in arrays:
+                raise ReadError(f"{self._place(state)}: its header tells of {name}, but it is not there")
+            found.append(_one_value(plain, arrays[theirs][0]))
+        values = np.stack(found).astype(np.float32)
+        return self._among_shells(values) if kind == "shell" else self._among_cells(kind, values)
+
+    def _among_shells(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Values of the deformable shells as values of all, NaN on those of rigid parts."""
+        count = len(self.mesh.face_nodes)
+        if values.shape[1] == count:
+            return values
+        materials = np.asarray(self._arrays.get("part_material_type", []), np.int64)
+        soft = materials[self.mesh.face_part] != _RIGID if len(materials) else np.zeros(count, bool)
+        if soft.sum() != values.shape[1]:
+            raise ReadError(
+                f"{self._file.first}: {values.shape[1]} of {count} shells have results, "
+                f"but {int(soft.sum())} are not in rigid parts; the file is damaged"
+            )
+        out = np.full((len(values), count, *values.shape[2:]), np.nan, np.float32)
+        out[:, soft] = values
+        return out
+
+    def _among_cells(self, kind: str, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Values of one kind of cells as values of all, NaN on the others."""
+        start = sum(self._counts[k] for k in _CELL_KINDS[: _CELL_KINDS.index(kind)])
+        out = np.full((len(values), sum(self._counts.values()), *values.shape[2:]), np.nan, np.float32)
+        out[:, start : start + values.shape[1]] = values
+        return out
+
+    def alive(self, first: int, last: int) -> NDArray[np.bool_] | None:
+        return self._living(("shell",), self.mesh.face_nodes, first, last)
+
+    def alive_cells(self, first: int, last: int) -> NDArray[np.bool_] | None:
+        return self._living(_CELL_KINDS, self.mesh.cell_nodes, first, last)
+
+    def _living(
+        self, kinds: tuple[str, ...], nodes: NDArray[np.int32], first: int, last: int
+    ) -> NDArray[np.bool_] | None:
+        """(state, element): element words other than zero; or, where nodes are told, elements with all their nodes."""
+        blocks = self._file.blocks
+        if not len(nodes):
+            return None
+        if "node_alive" in blocks:
+            there = np.stack([np.append(self._file.block("node_alive", s) != 0, True) for s in range(first, last)])
+            return np.asarray(there[:, nodes].all(axis=2))  # node -1 of the padding is the True appended
+        if not any(f"{kind}_alive" in blocks for kind in kinds):
+            return None
+        rows = []
+        for state in range(first, last):
+            told = [
+                self._file.block(f"{kind}_alive", state) != 0
+                if f"{kind}_alive" in blocks
+                else np.ones(self._counts[kind], bool)
+                for kind in kinds
+            ]
+            rows.append(np.concatenate(told))
+        return np.stack(rows)
+
+
+def _one_value(plain: str, values: NDArray[Any]) -> NDArray[Any]:
+    """One value an element from its integration points: (element, point[, component]) -> (element[, component])."""
+    if plain == "von_mises":
+        xx, yy, zz, xy, yz, zx = np.moveaxis(values.astype(np.float64), -1, 0)
+        squared = ((xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2) / 2 + 3 * (xy**2 + yz**2 + zx**2)
+        return np.sqrt(squared).max(axis=1)
+    if plain == "plastic_strain":
+        return values.max(axis=1)
+    if plain in ("stress", "strain"):
+        return values.mean(axis=1, dtype=np.float64)
+    return values
+
+
+def _family(first: Path) -> dict[int, Path]:
+    """Number -> file of the family behind its first file, in the order of their numbers."""
+    name = re.compile(re.escape(first.name) + r"(\d+)")
+    files = sorted(p for p in first.parent.iterdir() if p.is_file())
+    found = {int(m[1]): file for file in files if (m := name.fullmatch(file.name))}
+    return dict(sorted(found.items()))
+
+
+def _gaps(first: Path, numbers: tuple[int, ...]) -> list[str]:
+    missing = sorted(set(range(1, max(numbers, default=0) + 1)) - set(numbers))
+    if not missing:
+        return []
+    names = ", ".join(f"{first.name}{n:02d}" for n in missing[:5]) + (", ..." if len(missing) > 5 else "")
+    return [
+        f"{first.parent}: {len(missing)} files of the family up to {first.name}{numbers[-1]:02d} are missing: {names}"
+    ]
+
+
+def _adapted(first: Path) -> list[str]:
+    """LS-DYNA begins a family with letters behind its name (d3plotaa) whenever it has remeshed."""
+    name = re.compile(re.escape(first.name) + r"[a-z]{2}")
+    found = sorted(p.name for p in first.parent.iterdir() if name.fullmatch(p.name))
+    if not found:
+        return []
+    return [f"{first.parent}: the mesh was adapted during the run ({found[0]} is there), which is not supported"]
+
+
+def _reason(problems: list[str]) -> str:
+    return problems[0] if problems else "the state files (d3plot01, ...) are missing"
+
+
+def _end_time(decks: list[Path]) -> float | None:
+    """ENDTIM of *CONTROL_TERMINATION, where all decks that have it agree."""
+    found = set()
+    for deck in decks:
+        try:
+            with deck.open(encoding="latin-1") as stream:
+                lines = iter(stream.read(_DECK_BYTES).splitlines())
+        except OSError:
+            continue
+        for line in lines:
+            if line.upper().startswith("*CONTROL_TERMINATION"):
+                card = next((rest for rest in lines if not rest.startswith("$")), "")
+                try:
+                    found.add(float(card.split(",")[0] if "," in card else card[:10]))
+                except ValueError:
+                    return None
+    return found.pop() if len(found) == 1 else None
+
+
+register(D3plot())
