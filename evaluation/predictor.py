@@ -1,8 +1,9 @@
-"""What evaluation needs to know of a surrogate: its name, where it lives, and how to ask it."""
+"""What evaluation needs to know of a surrogate: its name, where it lives, how to ask it, and what it has seen."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -15,6 +16,7 @@ class Predictor(Protocol):
     name          "MH1", "PODNN", "POD-GPR r=12", ...
     level         the mesh level it predicts on; 0 is the full mesh
     n_parameters  trained numbers, the budget shown beside the errors
+    n_latent      numbers a state is reduced to (4 in the paper); the POD floor beside it has as many modes
     seconds_per_epoch, training_seconds  as recorded during training (NaN where it makes no sense)
     history       epoch curves by name: "total", "approximation", "reconstruction"; empty where not iterative
     """
@@ -22,6 +24,7 @@ class Predictor(Protocol):
     name: str
     level: int
     n_parameters: int
+    n_latent: int
     seconds_per_epoch: float
     training_seconds: float
     history: Mapping[str, NDArray[np.float64]]
@@ -31,3 +34,27 @@ class Predictor(Protocol):
 
     def reconstruct(self, displacement: NDArray[np.float32]) -> NDArray[np.float32]:
         """Encode and decode (state, node of its level, 3): what reduction alone costs."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A trained model: one predictor for each level it can answer on, finest first, and what it has seen.
+
+    name            what the model is called where folders are told apart: the folder's name
+    predictors      finest level first; a cascade has several, a baseline one
+    fitted_runs     runs whose states trained it
+    tuned_runs      runs that chose anything: best epoch, number of modes, settings
+    held_out_runs   runs it was told to leave alone; what a comparison is made on
+    checksum        SHA-256 of the dataset it was trained on
+    seed            of its training; None where nothing is random
+    configuration   its settings, for the methods section; without the seed, models of one kind agree in it
+    """
+
+    name: str
+    predictors: tuple[Predictor, ...]
+    fitted_runs: tuple[str, ...] = ()
+    tuned_runs: tuple[str, ...] = ()
+    held_out_runs: tuple[str, ...] = ()
+    checksum: str = ""
+    seed: int | None = None
+    configuration: Mapping[str, object] = field(default_factory=dict)

@@ -1,0 +1,126 @@
+"""Who is compared with whom, on which runs, and what forbids it.
+
+A comparison is honest when every model is asked about the same runs and none of them, nor anything that was
+chosen with them, has seen one. The names of the runs a model saw are kept in its folder; here they are held
+against each other.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from evaluation.errors import EvaluationError
+from evaluation.predictor import Model, Predictor
+from evaluation.reference import Reference
+from evaluation.scoring import Key
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One row of the comparison: the same predictor of one model, or of its several seeds.
+
+    label   as in tables, figures and files
+    level   the mesh level it predicts on
+    keys    (model, predictor) numbers of its seeds, at least one
+    """
+
+    label: str
+    level: int
+    keys: tuple[Key, ...]
+
+
+@dataclass(frozen=True)
+class Split:
+    """Run numbers: `test` for the comparison, `train` for what describes the data (modes, coverage)."""
+
+    train: tuple[int, ...]
+    test: tuple[int, ...]
+
+
+def agree_on_split(reference: Reference, models: Sequence[Model], test: Sequence[str] | None = None) -> Split:
+    """The test runs: those asked for, else those that all models hold out.
+
+    Raises EvaluationError where a model was fitted or tuned on a test run, where the models hold out different
+    runs and none were asked for, where a model was trained on another dataset, and where no test run is left.
+    """
+    for model in models:
+        if model.checksum and reference.checksum and model.checksum != reference.checksum:
+            raise EvaluationError(
+                f"{model.name} was trained on another dataset (checksum {model.checksum[:12]}, this one has "
+                f"{reference.checksum[:12]}); expected one and the same: give the dataset it was trained on, or "
+                f"train it again on this one"
+            )
+    names = tuple(test) if test is not None else _held_out(models)
+    if not names:
+        raise EvaluationError(
+            "no test runs: the models hold none out and none were asked for; name them with --test, such as --test "
+            "27:36, and train with the same runs held out"
+        )
+    numbers = reference.index(names)
+    for model in models:
+        for what, seen in (("trained", model.fitted_runs), ("tuned", model.tuned_runs)):
+            common = sorted(set(seen) & set(names), key=names.index)
+            if common:
+                raise EvaluationError(
+                    f"{model.name} was {what} on {len(common)} of the {len(names)} test runs ({_some(common)}); an "
+                    f"error on them says nothing: choose other test runs, or train it again with these held out"
+                )
+    taken = set(numbers)
+    return Split(tuple(k for k in range(len(reference.runs)) if k not in taken), numbers)
+
+
+def _held_out(models: Sequence[Model]) -> tuple[str, ...]:
+    first = models[0]
+    for model in models[1:]:
+        if set(model.held_out_runs) != set(first.held_out_runs):
+            raise EvaluationError(
+                f"{first.name} holds out {_count(first)} and {model.name} {_count(model)}; expected one split for all: "
+                f"train them with the same --test, or name test runs that none of them has seen with --test"
+            )
+    return first.held_out_runs
+
+
+def _count(model: Model) -> str:
+    runs = model.held_out_runs
+    return f"{len(runs)} runs ({_some(runs)})" if runs else "no runs"
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names) if len(names) <= 4 else f"{', '.join(names[:3])}, ... {names[-1]}"
+
+
+def entries(models: Sequence[Model], seeds_as_spread: bool = True) -> tuple[Entry, ...]:
+    """The rows of the comparison, in the order the models were given.
+
+    Models of equal configuration that differ in nothing but the seed become one row with a spread; otherwise
+    equal names are told apart by the model's own name. Raises EvaluationError for no model, for a predictor on two
+    rows of the same label and for one model given twice.
+    """
+    if not models:
+        raise EvaluationError("no model to evaluate; give at least one model folder")
+    rows: dict[tuple[str, str], list[tuple[Key, Predictor]]] = {}
+    for m, model in enumerate(models):
+        kind = json.dumps(model.configuration, sort_keys=True, default=str) if seeds_as_spread else f"model {m}"
+        for p, predictor in enumerate(model.predictors):
+            rows.setdefault((predictor.name, kind), []).append(((m, p), predictor))
+    for members in rows.values():
+        seeds = [models[key[0]].seed for key, _ in members]
+        if len(members) > 1 and len(set(seeds)) < len(seeds):
+            folders = " and ".join(models[key[0]].name for key, _ in members)
+            raise EvaluationError(
+                f"{folders} have the same settings and the same seed ({seeds[0]}), so they are one model given twice; "
+                f"leave one out, or train it again with another --seed"
+            )
+    times = [name for name, _ in rows]
+    out = []
+    for (name, _), members in rows.items():
+        first = models[members[0][0][0]]
+        label = name if times.count(name) == 1 else f"{name} ({first.name})"
+        out.append(Entry(label, members[0][1].level, tuple(key for key, _ in members)))
+    labels = [e.label for e in out]
+    for label in labels:
+        if labels.count(label) > 1:
+            raise EvaluationError(f"two models are called {label}; expected different folder names to tell them apart")
+    return tuple(out)

@@ -1,0 +1,127 @@
+"""What the models cost: seconds an epoch, milliseconds a prediction with and without lifting, error against cost."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from evaluation.figures.kind import Columns, Kind
+from evaluation.figures.style import CM, INK, Sheet
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from evaluation.result import Evaluation
+
+
+@dataclass(frozen=True)
+class Budget:
+    """seconds_per_epoch and training_seconds s (NaN where it makes no sense), own and lifted ms a state, error m."""
+
+    seconds_per_epoch: float
+    training_seconds: float
+    own: float
+    lifted: float
+    parameters: int
+    error: float
+
+
+@dataclass(frozen=True)
+class Budgets:
+    """budgets: model -> its costs."""
+
+    budgets: Mapping[str, Budget]
+
+    def numbers(self) -> Columns:
+        b = self.budgets.values()
+        return {
+            "model": list(self.budgets),
+            "seconds_per_epoch": [x.seconds_per_epoch for x in b],
+            "training_s": [x.training_seconds for x in b],
+            "prediction_own_level_ms": [x.own for x in b],
+            "prediction_full_mesh_ms": [x.lifted for x in b],
+            "parameters": [x.parameters for x in b],
+            "mean_node_error_cm": [x.error * CM for x in b],
+        }
+
+    def draw(self, sheet: Sheet) -> Figure:
+        figure, (epoch, predict, trade) = sheet.panels(3, height=6.6)
+        trained = [m for m, b in self.budgets.items() if np.isfinite(b.seconds_per_epoch)]
+        _bars(epoch, sheet, trained, [self.budgets[m].seconds_per_epoch for m in trained])
+        epoch.set_title("training")
+        epoch.set_xlabel("seconds an epoch")
+        models = list(self.budgets)
+        at = np.arange(len(models))[::-1]
+        for y, m in zip(at, models, strict=True):
+            colour, b = sheet.style(m).colour, self.budgets[m]
+            predict.barh(y + 0.19, b.own, 0.36, color=colour)
+            predict.barh(y - 0.19, b.lifted, 0.36, color=colour, alpha=0.4)
+        predict.set_yticks(at, models)
+        predict.set_xscale("log")
+        predict.set_xlabel("milliseconds a state")
+        predict.set_title("prediction: own level, lifted (pale)", fontsize=8)
+        predict.grid(axis="y", visible=False)
+        for m, b in self.budgets.items():
+            style = sheet.style(m)
+            trade.plot(
+                b.lifted, b.error * CM, marker=style.marker, color=style.colour, markersize=6.5, linestyle="none"
+            )
+            trade.annotate(
+                m, (b.lifted, b.error * CM), xytext=(5, 3), textcoords="offset points", fontsize=7, color=INK
+            )
+        trade.set_xscale("log")
+        trade.margins(x=0.3, y=0.12)
+        trade.set_xlabel("milliseconds a state, full mesh")
+        trade.set_ylabel("mean node error (cm)")
+        trade.set_title("error for its price")
+        return figure
+
+    def caption(self) -> str:
+        fastest = min(self.budgets, key=lambda m: self.budgets[m].lifted)
+        best = min(self.budgets, key=lambda m: self.budgets[m].error)
+        f, b = self.budgets[fastest], self.budgets[best]
+        front = [
+            m for m, x in self.budgets.items()
+            if not any(y.lifted <= x.lifted and y.error < x.error for k, y in self.budgets.items() if k != m)
+        ]  # fmt: skip
+        return (
+            f"Left: seconds an epoch took in training (models fitted in one go have none). Middle: milliseconds "
+            f"a state "
+            f"of a whole run on the model's own mesh, and pale with lifting to the full mesh. Right: error against "
+            f"the time of a prediction on the full mesh; only {', '.join(front)} are not beaten in both at once. "
+            f"Fastest "
+            f"is {fastest} ({f.lifted:.3g} ms, {f.error * CM:.2f} cm), most accurate {best} ({b.lifted:.3g} ms, "
+            f"{b.error * CM:.2f} cm)."
+        )
+
+
+def _bars(ax: Axes, sheet: Sheet, models: list[str], values: list[float]) -> None:
+    at = np.arange(len(models))[::-1]
+    for y, m, value in zip(at, models, values, strict=True):
+        ax.barh(y, value, 0.6, color=sheet.style(m).colour)
+        ax.text(value, y, f" {value:.2g}", va="center", fontsize=7.5, color=INK)
+    ax.set_yticks(at, models)
+    ax.grid(axis="y", visible=False)
+    if values and max(values) > 30 * min(values):
+        ax.set_xscale("log")
+    ax.margins(x=0.2)
+
+
+def select(evaluation: Evaluation) -> Budgets | None:
+    if not evaluation.timings:
+        return None
+    out = {}
+    for e in evaluation.entries:
+        predictor, timing = evaluation.predictor(e), evaluation.timings[e.label]
+        out[e.label] = Budget(
+            predictor.seconds_per_epoch, predictor.training_seconds, timing.own, timing.lifted,
+            predictor.n_parameters, evaluation.scores[e.label].mean,
+        )  # fmt: skip
+    return Budgets(out)
+
+
+FIGURE = Kind("budgets", "What the models cost", select)

@@ -1,0 +1,119 @@
+"""How the runs cover the design space: a scatter matrix of the parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaluation.figures.kind import Columns, Kind
+from evaluation.figures.style import Sheet, look, span
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from evaluation.result import Evaluation
+
+_TRAIN, _TEST = "#0072B2", "#D55E00"
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """values (run, parameter); test (run,) bool, all False for a dataset alone."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    runs: tuple[str, ...]
+    values: NDArray[np.float64]
+    test: NDArray[np.bool_]
+
+    def numbers(self) -> Columns:
+        columns: dict[str, list[object]] = {
+            "run": list(self.runs),
+            "role": ["test" if t else "train" for t in self.test],
+        }
+        for k, (name, unit) in enumerate(zip(self.names, self.units, strict=True)):
+            columns[f"{name} ({unit})"] = list(self.values[:, k])
+        return columns
+
+    def draw(self, sheet: Sheet) -> Figure:
+        from matplotlib.figure import Figure
+
+        n = len(self.names)
+        side = min(sheet.width, 4.2 * n)
+        with look():
+            figure = Figure(figsize=(side / 2.54, side / 2.54), layout="constrained")
+            grid = figure.subplots(n, n, squeeze=False)
+        for i in range(n):
+            for j in range(n):
+                ax = grid[i, j]
+                if i == j:
+                    parts = [self.values[~self.test, i], self.values[self.test, i]]
+                    ax.hist(parts, bins=8, stacked=True, color=[_TRAIN, _TEST], rwidth=0.92)
+                    ax.set_yticks([])
+                    ax.grid(visible=False)
+                elif j > i:
+                    ax.remove()
+                    continue
+                else:
+                    for chosen, colour, marker in ((~self.test, _TRAIN, "o"), (self.test, _TEST, "D")):
+                        ax.plot(
+                            self.values[chosen, j], self.values[chosen, i], linestyle="none", marker=marker,
+                            color=colour, markersize=3.2, markeredgewidth=0, alpha=0.8,
+                        )  # fmt: skip
+                    ax.margins(0.06)
+                if i == n - 1:
+                    ax.set_xlabel(span(self.names[j], self.units[j]))
+                else:
+                    ax.tick_params(labelbottom=False)
+                if j == 0 and i > 0:
+                    ax.set_ylabel(span(self.names[i], self.units[i]))
+                elif j > 0:
+                    ax.tick_params(labelleft=False)
+        if self.test.any():
+            from matplotlib.lines import Line2D
+
+            handles = [
+                Line2D([], [], marker=m, color=c, linestyle="none", label=f"{label} ({count})")
+                for m, c, label, count in (
+                    ("o", _TRAIN, "train", int((~self.test).sum())), ("D", _TEST, "test", int(self.test.sum())),
+                )
+            ]  # fmt: skip
+            figure.legend(handles=handles, loc="upper right", fontsize=8)
+        return figure
+
+    def caption(self) -> str:
+        low, high = self.values.min(axis=0), self.values.max(axis=0)
+        ranges = "; ".join(
+            f"{span(name, '')} {a:g} to {b:g} {span('', unit).strip(' ()')}".strip()
+            for name, unit, a, b in zip(self.names, self.units, low, high, strict=True)
+        )
+        outside = 0
+        if self.test.any() and (~self.test).any():
+            train = self.values[~self.test]
+            beyond = (self.values[self.test] < train.min(axis=0)) | (self.values[self.test] > train.max(axis=0))
+            outside = int(beyond.any(axis=1).sum())
+        note = (
+            f" {outside} test runs lie outside the range of the training runs, where models extrapolate."
+            if outside
+            else (" No test run lies outside the ranges of the training runs." if self.test.any() else "")
+        )
+        return (
+            f"Where the runs lie in the design space: {ranges}. Empty patches are places about which the models "
+            f"were told "
+            f"nothing.{note}"
+        )
+
+
+def select(evaluation: Evaluation) -> Coverage | None:
+    reference = evaluation.reference
+    if not reference.parameter_names:
+        return None
+    test = np.zeros(len(reference.runs), bool)
+    test[list(evaluation.split.test)] = True
+    return Coverage(reference.parameter_names, reference.parameter_units, reference.runs, reference.parameters, test)
+
+
+FIGURE = Kind("coverage", "How the runs cover the design space", select)

@@ -1,0 +1,129 @@
+"""What is reduction error and what is regression error: every model beside the POD projection floor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaluation.figures.kind import Columns, Kind
+from evaluation.figures.style import CM, FAINT, INK, Sheet
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from evaluation.result import Evaluation
+
+
+@dataclass(frozen=True)
+class Point:
+    """One model: numbers a state is reduced to, and its errors on the full mesh, m."""
+
+    latent: int
+    total: float
+    reduction: float
+    lifting: float
+
+
+@dataclass(frozen=True)
+class Floors:
+    """floor (mode,) m: error of projecting the test runs on 1, 2, ... modes of the training runs."""
+
+    floor: NDArray[np.float64]
+    points: Mapping[str, Point]
+
+    def numbers(self) -> Columns:
+        modes = list(range(1, len(self.floor) + 1))
+        rows: list[tuple[Any, ...]] = [
+            ("POD projection floor", r, e * CM, None, None) for r, e in zip(modes, self.floor, strict=True)
+        ]
+        rows += [(label, p.latent, p.total * CM, p.reduction * CM, p.lifting * CM) for label, p in self.points.items()]
+        names = ("what", "latent_size", "mean_node_error_cm", "reduction_error_cm", "lifting_error_cm")
+        return dict(zip(names, zip(*rows, strict=True), strict=True))
+
+    def draw(self, sheet: Sheet) -> Figure:
+        figure, (left, right) = sheet.panels(2, height=6.8)
+        modes = np.arange(1, len(self.floor) + 1)
+        left.plot(modes, self.floor * CM, color=INK, linewidth=1.4, label="POD projection floor")
+        left.fill_between(modes, self.floor * CM, color="#eeeeee", zorder=0)
+        for label, p in self.points.items():
+            style = sheet.style(label)
+            left.plot(
+                p.latent, p.total * CM, linestyle="none", marker=style.marker, color=style.colour, markersize=6.5,
+                label=label,
+            )  # fmt: skip
+        left.set_xscale("log")
+        left.set_yscale("log")
+        ticks = [t for t in (1, 2, 4, 8, 16, 32, 50) if t <= len(self.floor)]
+        left.set_xticks(ticks, [str(t) for t in ticks])
+        left.minorticks_off()
+        values = np.concatenate([self.floor, [p.total for p in self.points.values()]]) * CM
+        levels = [
+            t for t in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50) if values.min() <= t <= values.max()
+        ]
+        left.set_yticks(levels, [f"{t:g}" for t in levels])
+        left.set_xlabel("numbers a state is reduced to")
+        left.set_ylabel("mean node error (cm)")
+        left.legend(loc="best", fontsize=7.5)
+        self._bars(right, sheet)
+        return figure
+
+    def _bars(self, ax: object, sheet: Sheet) -> None:
+        labels = list(self.points)
+        at = np.arange(len(labels))[::-1]
+        for y, label in zip(at, labels, strict=True):
+            p = self.points[label]
+            colour = sheet.style(label).colour
+            ax.barh(y, p.total * CM, height=0.62, color=colour, alpha=0.35)  # type: ignore[attr-defined]
+            ax.barh(y, p.reduction * CM, height=0.62, color=colour)  # type: ignore[attr-defined]
+            if p.lifting:
+                ax.plot(  # type: ignore[attr-defined]
+                    [p.lifting * CM] * 2, [y - 0.36, y + 0.36], color="black", linewidth=1.4
+                )
+            ax.text(  # type: ignore[attr-defined]
+                max(p.total, p.reduction) * CM, y, f" {p.total * CM:.2f}", va="center", fontsize=8, color=INK
+            )
+        ax.set_yticks(at, labels)  # type: ignore[attr-defined]
+        ax.grid(axis="y", visible=False)  # type: ignore[attr-defined]
+        ax.set_xlabel("mean node error (cm)")  # type: ignore[attr-defined]
+        ax.set_title("pale: all · full: reduction · bar: lifting", color=FAINT, fontweight="normal", fontsize=8)  # type: ignore[attr-defined]
+        ax.margins(x=0.14)  # type: ignore[attr-defined]
+
+    def caption(self) -> str:
+        best = min(self.points, key=lambda label: self.points[label].total)
+        p = self.points[best]
+        need = np.flatnonzero(self.floor <= p.total)
+        modes = (
+            f"a projection on {need[0] + 1} modes would be as exact"
+            if need.size
+            else f"no projection on up to {len(self.floor)} modes would be as exact"
+        )
+        share = 100 * min(1.0, p.reduction / p.total)
+        return (
+            f"Left: the line is what a linear reduction of the test runs costs before any regression; a model above it "
+            f"loses the rest to regression, a model below it reduces better than POD with as many numbers. Right: the "
+            f"full bar is the error of encoding and decoding the truth, the pale bar the error of the prediction, the "
+            f"black mark what lifting from the coarse mesh costs even if all else were exact. For {best}, "
+            f"{modes}, and reduction makes {share:.0f} % of the size of its error."
+        )
+
+
+def select(evaluation: Evaluation) -> Floors | None:
+    if not evaluation.pods:
+        return None
+    points = {
+        e.label: Point(
+            evaluation.predictor(e).n_latent,
+            evaluation.scores[e.label].mean,
+            evaluation.scores[e.label].reduction,
+            evaluation.lifting(e.level),
+        )
+        for e in evaluation.entries
+    }
+    return Floors(evaluation.floor(), points)
+
+
+FIGURE = Kind("floors", "Reduction or regression: where the error comes from", select)

@@ -1,0 +1,147 @@
+"""One look for every figure: sizes in centimetres, a palette that the colour-blind can read, a style a model.
+
+Colours are those of Okabe and Ito (2008), which stay apart in all common kinds of colour blindness; line style
+and marker tell models apart once more, so that figures survive a black-and-white printer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+CM = 100.0  # metres to centimetres
+MS = 1000.0  # seconds to milliseconds
+INK = "#222222"
+FAINT = "#8a8a8a"
+GRID = "#e4e4e4"
+
+_FIXED = {
+    "MH1": "#0072B2", "MH2": "#56B4E9", "MH3": "#009E73", "MH4": "#4B7A00",
+    "PODNN": "#D55E00", "POD-GPR": "#E69F00", "POD-RBF": "#A0522D",
+    "AENN": "#CC79A7", "GAENN": "#7A5BA6",
+}  # fmt: skip
+_OTHERS = ("#332288", "#882255", "#117733", "#AA4499", "#44AA99", "#999933", "#661100", "#6699CC", "#888888")
+_LINES: tuple[Any, ...] = ("-", "--", "-.", (0, (1, 1.2)), (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)))
+_MARKERS = "osD^vPX<>hp*"
+
+_RC: Any = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 8.5,
+    "axes.titlesize": 9,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.labelsize": 8.5,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": "#555555",
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": GRID,
+    "grid.linewidth": 0.6,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "xtick.color": "#444444",
+    "ytick.color": "#444444",
+    "legend.fontsize": 8,
+    "legend.frameon": False,
+    "legend.handlelength": 2.2,
+    "lines.linewidth": 1.6,
+    "lines.markersize": 4,
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+    "svg.hashsalt": "crashkit",  # the same figure gives the same file
+    "svg.fonttype": "path",
+}
+
+
+@dataclass(frozen=True)
+class Style:
+    """How one model looks wherever it appears."""
+
+    colour: str
+    line: Any
+    marker: str
+
+
+def styles(labels: Sequence[str]) -> dict[str, Style]:
+    """A style for each label: the fixed colour of a known kind of model, else the next free one."""
+    out: dict[str, Style] = {}
+    taken: set[str] = set()
+    for k, label in enumerate(labels):
+        fixed = _FIXED.get(label.split(" ")[0])
+        free = [c for c in _OTHERS if c not in taken]
+        colour = fixed if fixed and fixed not in taken else (free[0] if free else _OTHERS[k % len(_OTHERS)])
+        taken.add(colour)
+        out[label] = Style(colour, _LINES[k % len(_LINES)], _MARKERS[k % len(_MARKERS)])
+    return out
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """The paper a figure is drawn on: 17 cm for a page, 9 cm for a phone, where panels stand below each other."""
+
+    width: float = 17.0
+    styles: Mapping[str, Style] = field(default_factory=dict)
+
+    @property
+    def narrow(self) -> bool:
+        return self.width < 12
+
+    def style(self, label: str) -> Style:
+        """The style of `label`; a plain one for what is no model."""
+        return self.styles.get(label, Style(INK, "-", "o"))
+
+    def panels(
+        self, count: int, height: float = 6.0, columns: int | None = None, share_y: bool = False, share_x: bool = False
+    ) -> tuple[Figure, list[Axes]]:
+        """A figure with `count` axes, each `height` cm high, side by side on a page and stacked on a phone."""
+        from matplotlib.figure import Figure
+
+        across = 1 if self.narrow else (columns or count)
+        down = -(-count // across)
+        with look():
+            figure = Figure(figsize=(self.width / 2.54, height * down / 2.54), layout="constrained")
+            grid = figure.subplots(down, across, squeeze=False, sharey=share_y, sharex=share_x)
+        axes = list(grid.ravel())
+        for extra in axes[count:]:
+            extra.remove()
+        return figure, axes[:count]
+
+    def legend(self, figure: Figure, axes: Axes, columns: int | None = None) -> None:
+        """One legend for the whole figure, above its panels."""
+        handles, labels = axes.get_legend_handles_labels()
+        if handles:
+            figure.legend(
+                handles, labels, loc="outside upper left", ncols=columns or min(len(labels), 3 if self.narrow else 6)
+            )
+
+
+def look() -> Any:
+    """The context in which figures are made and written."""
+    import matplotlib as mpl
+
+    return mpl.rc_context(_RC)
+
+
+def smoothed(values: NDArray[np.float64], window: int | None = None) -> NDArray[np.float64]:
+    """Running median over `window` epochs (default one fortieth of all, at least 3), as long as `values`."""
+    size = window or max(3, len(values) // 40)
+    half = size // 2
+    return np.array([np.median(values[max(0, k - half) : k + half + 1]) for k in range(len(values))])
+
+
+def span(label: str, unit: str) -> str:
+    """An axis label: what it is, and its unit where it has one."""
+    pretty = {"m s-1": "m/s", "degree": "°", "1": ""}.get(unit, unit)
+    return f"{label.replace('_', ' ')} ({pretty})" if pretty else label.replace("_", " ")

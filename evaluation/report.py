@@ -1,0 +1,169 @@
+"""The report: an `Evaluation` as a folder with `report.html`, figures, tables as CSV, and all numbers as JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from evaluation import tables
+from evaluation.figures import ORDER, drawings, sheet_of
+from evaluation.figures.kind import Columns, to_csv
+from evaluation.figures.style import CM
+from evaluation.page import Page, ShownFigure, ShownTable, ShownView, render_page, show_figure, show_table
+from evaluation.result import Evaluation
+from evaluation.verdict import RULES, statements
+
+_HEADINGS = {
+    "model": "model", "nodes": "nodes", "error_cm": "mean node error (cm)", "spread_cm": "± over seeds (cm)",
+    "relative_percent": "relative (%)", "worst_run_cm": "worst run (cm)", "peak_cm": "largest anywhere (cm)",
+    "reduction_cm": "reduction alone (cm)", "pod_floor_cm": "POD floor, same size (cm)", "latent": "latent size",
+    "parameters": "parameters", "training_s": "training (s)", "prediction_lifted_ms": "ms a state",
+}  # fmt: skip
+_ALL_HEADINGS = _HEADINGS | {
+    "level": "level", "seeds": "seeds", "worst_run": "which run", "lifting_cm": "lifting alone (cm)",
+    "seconds_per_epoch": "s an epoch", "prediction_ms": "ms a state, own level",
+    "prediction_lifted_ms": "ms a state, full mesh", "single_prediction_ms": "ms for one state alone, full mesh",
+}  # fmt: skip
+_LOWEST = (
+    "error_cm", "relative_percent", "worst_run_cm", "peak_cm", "training_s", "parameters", "prediction_lifted_ms",
+    "prediction_ms", "seconds_per_epoch", "single_prediction_ms",
+)  # fmt: skip
+
+_TEXT = (
+    "The mean node error e2 is the Euclidean distance between the node of the solver's run and the predicted node, "
+    "averaged over nodes, then over time, then over the test runs, each run and each state counting the same. It is "
+    "an error of displacements, in centimetres, on the full mesh: predictions on a coarse mesh are lifted to it with "
+    "the static barycentric upsampling, the same for every model. Nodes whose elements have all failed take no part.",
+    "The relative error is the L2 norm of the displacement error over all nodes and states of a run, divided by "
+    "that of "
+    "the displacement, and averaged over the runs; it does not depend on where the origin lies. "
+    "The POD floor is the error of projecting the test runs themselves on the leading modes of all other runs: "
+    "no model that reduces linearly to as many numbers on the same modes can be better.",
+    "Milliseconds are medians over repetitions on the machine named below, for all states of a run asked in one call "
+    "and divided by their number, unless a column says otherwise.",
+)
+
+
+def write_report(
+    evaluation: Evaluation,
+    folder: Path,
+    *,
+    title: str = "How far can these surrogates be trusted?",
+    views: Sequence[ShownView] = (),
+    extra: Sequence[ShownFigure] = (),
+    names: Sequence[str] = ORDER,
+    done: Callable[[str], None] | None = None,
+) -> Path:
+    """Write report.html, report.json, figures/ (PNG, SVG, CSV) and tables/ (CSV) into `folder`; returns the page.
+
+    views  interactive views for the page
+    extra  figures made elsewhere, shown behind the first
+    names  the figures, in their order
+    done   called with the name of each figure when it is written
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    sheet = sheet_of(evaluation)
+    shown: list[ShownFigure] = []
+    figure_numbers: dict[str, Columns] = {}
+    for kind, drawing in drawings(evaluation, names):
+        shown.append(show_figure(kind, drawing, folder / "figures", sheet, folder))
+        figure_numbers[kind.name] = drawing.numbers()
+        if done:
+            done(kind.name)
+    shown[1:1] = extra
+    rows = tables.performance(evaluation)
+    performance = tables.columns(rows)
+    performance["relative_percent"] = [100 * v for v in performance["relative"]]
+    all_tables: dict[str, Columns] = {
+        "performance": tables.columns(rows),
+        "runs": tables.of_runs(evaluation),
+        "worst": tables.worst_places(evaluation),
+        "split": tables.split(evaluation),
+    }
+    (folder / "tables").mkdir(exist_ok=True)
+    for name, columns in all_tables.items():
+        (folder / "tables" / f"{name}.csv").write_text(to_csv(columns), encoding="utf-8")
+    said = statements(evaluation)
+    page = Page(
+        title=title,
+        subtitle=_subtitle(evaluation),
+        statements=said,
+        rules=RULES,
+        key_table=_key_table(performance),
+        figures=shown,
+        views=views,
+        text=_TEXT,
+        methods=list(evaluation.context.items()),
+        details=_details(evaluation),
+        tables=_tables(performance, all_tables),
+    )
+    numbers = {
+        "performance": [asdict(row) for row in rows],
+        "statements": [asdict(s) for s in said],
+        "tables": {name: columns for name, columns in all_tables.items() if name != "performance"},
+        "figures": figure_numbers,
+        "context": dict(evaluation.context),
+        "test_runs": list(evaluation.test_names),
+        "mean_displacement_cm": evaluation.size * CM,
+    }
+    (folder / "report.json").write_text(json.dumps(_plain(numbers), indent=1), encoding="utf-8")
+    path = folder / "report.html"
+    path.write_text(render_page(page), encoding="utf-8")
+    return path
+
+
+def _subtitle(evaluation: Evaluation) -> str:
+    reference = evaluation.reference
+    name = reference.attributes.get("title") or evaluation.context.get("Dataset", "")
+    return (
+        f"{name + ': ' if name else ''}{len(evaluation.entries)} models on {len(evaluation.runs)} test runs that "
+        f"none of "
+        f"them has seen; {len(reference.time)} states of {reference.n_nodes} nodes, which move by "
+        f"{evaluation.size * CM:.1f} cm on average"
+    )
+
+
+def _key_table(performance: Columns) -> ShownTable:
+    several = any(v == v for v in performance["spread_cm"])
+    headings = {k: v for k, v in _HEADINGS.items() if several or k != "spread_cm"}
+    note = "Lengths on the full mesh. The best of a column is set in bold; explanations stand under Methods."
+    return show_table("Performance", performance, note, headings, _LOWEST)
+
+
+def _tables(performance: Columns, all_tables: Mapping[str, Columns]) -> list[ShownTable]:
+    return [
+        show_table("Performance, every column", performance, "", _ALL_HEADINGS, _LOWEST),
+        show_table("Worst run, worst node, worst time", all_tables["worst"], "Nodes carry the solver's own numbers."),
+        show_table("Every test run", all_tables["runs"], "Mean node error over nodes and time, cm."),
+        show_table("What each run was used for", all_tables["split"]),
+    ]
+
+
+def _details(evaluation: Evaluation) -> list[tuple[str, str]]:
+    return [
+        (
+            f"Configuration of {model.name} ({', '.join(p.name for p in model.predictors)}"
+            + (f", seed {model.seed})" if model.seed is not None else ")"),
+            json.dumps(_plain(dict(model.configuration)), indent=1, sort_keys=True),
+        )
+        for model in evaluation.models
+    ]
+
+
+def _plain(value: Any) -> Any:
+    """`value` for JSON, which knows no NaN and no arrays."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple, set)):
+        return [_plain(v) for v in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if value is None or isinstance(value, (str, int, float, bool)):
+        return value
+    return str(value)

@@ -1,0 +1,152 @@
+"""Everything an evaluation found, for figures, tables and words; and the function that finds it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaluation.comparison import Entry, Split, entries
+from evaluation.errors import EvaluationError
+from evaluation.measures import masked_mean
+from evaluation.pod import Pod, StreamedPod
+from evaluation.predictor import Model, Predictor
+from evaluation.reference import Reference
+from evaluation.scoring import Groups, Key, RunScores, Scores, gather, score_run
+from evaluation.streaming import over_runs
+from evaluation.timing import Timing, time_predictions
+
+N_MODES = 50  # as many singular values as the paper shows
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The comparison of `entries` on the test runs of `split`.
+
+    scores    label of an entry -> its scores
+    runs      one RunScores a test run: sizes of the truth, floors, costs of lifting
+    pods      level -> decomposition of the training runs on its nodes
+    timings   label -> milliseconds of a prediction; empty where not timed
+    context   name -> text for the methods section: data, split, versions, machine
+    group_names  grouping -> name of each group
+    """
+
+    reference: Reference
+    models: tuple[Model, ...]
+    entries: tuple[Entry, ...]
+    split: Split
+    scores: Mapping[str, Scores]
+    runs: tuple[RunScores, ...]
+    pods: Mapping[int, Pod]
+    timings: Mapping[str, Timing]
+    group_names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    context: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def test_names(self) -> tuple[str, ...]:
+        return tuple(self.reference.runs[k] for k in self.split.test)
+
+    def predictor(self, entry: Entry, seed: int = 0) -> Predictor:
+        """The predictor of one seed of `entry`."""
+        model, number = entry.keys[seed]
+        return self.models[model].predictors[number]
+
+    def model(self, entry: Entry, seed: int = 0) -> Model:
+        """The model that one seed of `entry` belongs to."""
+        return self.models[entry.keys[seed][0]]
+
+    def floor(self, level: int = 0) -> NDArray[np.float64]:
+        """(mode,) m: mean over time and test runs of the projection error on 1, 2, ... modes."""
+        return masked_mean(masked_mean(np.array([r.floor[level] for r in self.runs]), axis=2), axis=0)
+
+    def floor_at(self, modes: int) -> float:
+        """The floor on the full mesh for as many modes, m; NaN where so many were not computed."""
+        floor = self.floor()
+        return float(floor[modes - 1]) if 1 <= modes <= len(floor) else float("nan")
+
+    def lifting(self, level: int) -> float:
+        """Mean error of lifting the truth itself from `level`, m; 0 on the full mesh."""
+        return 0.0 if level == 0 else float(masked_mean(np.array([r.lifting[level] for r in self.runs])))
+
+    @property
+    def size(self) -> float:
+        """Mean displacement over nodes, time and test runs, m: what errors are to be held against."""
+        return float(masked_mean(np.array([r.size for r in self.runs])))
+
+    @property
+    def ranked(self) -> tuple[Entry, ...]:
+        """Entries by mean error, best first."""
+        return tuple(sorted(self.entries, key=lambda e: self.scores[e.label].mean))
+
+
+def predictors_of(models: Sequence[Model]) -> dict[Key, Predictor]:
+    """Every predictor of every model under its two numbers."""
+    return {(m, p): predictor for m, model in enumerate(models) for p, predictor in enumerate(model.predictors)}
+
+
+def decompose(
+    reference: Reference,
+    runs: Sequence[int],
+    count: int = N_MODES,
+    done: Callable[[int], None] | None = None,
+) -> dict[int, Pod]:
+    """POD of `runs` on the full mesh and on every coarse level, reading each run once: level -> Pod."""
+    streams = {level: StreamedPod(count) for level in range(len(reference.levels) + 1)}
+    for run in runs:
+        truth = reference.displacement(run)
+        for level, stream in streams.items():
+            stream.add(truth if level == 0 else truth[:, reference.level(level).kept])
+        if done:
+            done(run)
+    return {level: stream.result() for level, stream in streams.items()}
+
+
+def default_groups(reference: Reference) -> tuple[Groups, dict[str, tuple[str, ...]]]:
+    """The node groups errors are split into: the parts of the model."""
+    return {"part": reference.part_nodes()}, {"part": reference.part_names}
+
+
+def compare(
+    reference: Reference,
+    models: Sequence[Model],
+    split: Split,
+    *,
+    seeds_as_spread: bool = True,
+    pods: Mapping[int, Pod] | None = None,
+    scored: Sequence[RunScores] | None = None,
+    timed: bool = True,
+    context: Mapping[str, str] | None = None,
+) -> Evaluation:
+    """Compare `models` on the test runs of `split`; everything in this process unless given.
+
+    pods     decomposition of the training runs, where it is there already
+    scored   one RunScores a test run, in the order of `split.test`, where they were computed elsewhere
+    timed    whether predictions are timed here
+
+    Raises EvaluationError where the models cannot be compared (see comparison.entries) or do not fit the data.
+    """
+    rows = entries(models, seeds_as_spread)
+    predictors = predictors_of(models)
+    groups, names = default_groups(reference)
+    if pods is None:
+        pods = decompose(reference, split.train)
+    if scored is None:
+        modes = {level: pod.modes for level, pod in pods.items()}
+        scored = over_runs(lambda run: score_run(reference, predictors, run, modes, groups), split.test)
+    if tuple(s.run for s in scored) != split.test:
+        raise EvaluationError("the scored runs are not the test runs in their order; expected one score for each")
+    timings = {row.label: time_predictions(reference, predictors[row.keys[0]], split.test[0]) for row in rows if timed}
+    return Evaluation(
+        reference=reference,
+        models=tuple(models),
+        entries=rows,
+        split=split,
+        scores={row.label: gather(scored, row.keys) for row in rows},
+        runs=tuple(scored),
+        pods=pods,
+        timings=timings,
+        group_names=names,
+        context=dict(context or {}),
+    )

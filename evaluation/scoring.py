@@ -1,0 +1,247 @@
+"""How wrong every model is on every test run, gathered one run at a time.
+
+`score_run` reads one run, asks every predictor for it, lifts the answers to the full mesh with the static
+upsampling and keeps the small numbers alone. Runs are independent, so they may be scored anywhere; `gather` puts
+them together in the order of the test runs, which makes the result independent of who computed what, and when.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaluation.errors import EvaluationError
+from evaluation.measures import (
+    Peak,
+    group_error,
+    largest_node_error,
+    lift,
+    masked_mean,
+    mean_node_error,
+    node_distance,
+    peak_error,
+    quantile_node_error,
+    relative_error,
+)
+from evaluation.pod import held, projection_error
+from evaluation.predictor import Predictor
+from evaluation.reference import Reference
+
+Key = tuple[int, int]  # number of the model, number of its predictor
+Groups = Mapping[str, Sequence[NDArray[np.integer]]]
+
+
+@dataclass(frozen=True)
+class RunScore:
+    """What one predictor got wrong on one run; lengths in metres, everything lifted to level 0 but `on_level`.
+
+    e2              (state,) mean node error of the prediction
+    reconstruction  (state,) the same of encoding and decoding the truth: what reduction alone costs
+    q95, largest    (state,) 95 % quantile and maximum over the nodes
+    on_level        (level 0 .., ) mean over time of the error on the nodes of each level; nodes are nested, so
+                    every model can be measured on the nodes of every level
+    on_level_reconstruction  the same for encoding and decoding
+    relative        of displacements, over all nodes and states (measures.relative_error)
+    peak            where and when it is worst
+    node_sum, node_count     (node,) sum over the states in which the node is there, and how many these are
+    groups          name of a grouping ("part", "region") -> (group,) error
+    """
+
+    e2: NDArray[np.float64]
+    reconstruction: NDArray[np.float64]
+    q95: NDArray[np.float64]
+    largest: NDArray[np.float64]
+    on_level: NDArray[np.float64]
+    on_level_reconstruction: NDArray[np.float64]
+    relative: float
+    peak: Peak
+    node_sum: NDArray[np.float64]
+    node_count: NDArray[np.int64]
+    groups: Mapping[str, NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class RunScores:
+    """Every predictor on one run, and what the run itself is.
+
+    size          (state,) mean displacement of the truth, m
+    group_size    grouping -> (group,) its mean over time
+    floor         level -> (mode, state) projection error on the nodes of the level, m
+    lifting       level >= 1 -> (state,) error of lifting the truth itself from that level: what the mesh costs
+    """
+
+    run: int
+    scores: Mapping[Key, RunScore]
+    size: NDArray[np.float64]
+    group_size: Mapping[str, NDArray[np.float64]]
+    floor: Mapping[int, NDArray[np.float64]]
+    lifting: Mapping[int, NDArray[np.float64]]
+
+
+def score_run(
+    reference: Reference,
+    predictors: Mapping[Key, Predictor],
+    run: int,
+    modes: Mapping[int, NDArray[np.float32]] | None = None,
+    groups: Groups | None = None,
+) -> RunScores:
+    """Score every predictor on run number `run`. Memory: the run and a few fields of its size.
+
+    modes   level -> (3 * node of the level, mode) from training runs, for the projection floor
+    groups  grouping -> node numbers of each group, such as {"part": reference.part_nodes()}
+
+    Raises EvaluationError naming model and run where a prediction does not fit the data or is not finite.
+    """
+    truth = reference.displacement(run)
+    states = (len(reference.time), reference.n_nodes, 3)
+    if truth.shape != states:
+        raise EvaluationError(f"run {reference.runs[run]} has shape {truth.shape}; expected {states}")
+    if not np.isfinite(truth).any():
+        raise EvaluationError(
+            f"run {reference.runs[run]} has no displacement that is a number, so there is no reference to compare "
+            f"with; leave it out of the test runs or ingest it again"
+        )
+    groups = groups or {}
+    still = node_distance(truth, np.zeros_like(truth))
+    scores: dict[Key, RunScore] = {}
+    for key, predictor in predictors.items():
+        try:
+            scores[key] = _score(reference, predictor, run, truth, groups)
+        except EvaluationError as error:
+            raise EvaluationError(f"{predictor.name} on run {reference.runs[run]}: {error}") from error
+    floor = {
+        level: projection_error(truth if level == 0 else truth[:, reference.level(level).kept], basis)
+        for level, basis in (modes or {}).items()
+    }
+    lifting = {
+        level.index: mean_node_error(node_distance(truth, lift(held(truth)[:, level.kept], level.to_full)))
+        for level in reference.levels
+    }
+    group_size = {name: group_error(still, nodes) for name, nodes in groups.items()}
+    return RunScores(run, scores, mean_node_error(still), group_size, floor, lifting)
+
+
+def _score(
+    reference: Reference, predictor: Predictor, run: int, truth: NDArray[np.float32], groups: Groups
+) -> RunScore:
+    own = truth if predictor.level == 0 else truth[:, reference.level(predictor.level).kept]
+    distance = node_distance(truth, full_field(reference, predictor, predictor.reconstruct(held(own))))
+    reconstruction = mean_node_error(distance)
+    on_level_reconstruction = _on_levels(reference, distance)
+    prediction = full_field(reference, predictor, predictor.predict(reference.parameters[run], reference.time))
+    distance = node_distance(truth, prediction)
+    there = ~np.isnan(distance)
+    return RunScore(
+        e2=mean_node_error(distance),
+        reconstruction=reconstruction,
+        q95=quantile_node_error(distance, 0.95),
+        largest=largest_node_error(distance),
+        on_level=_on_levels(reference, distance),
+        on_level_reconstruction=on_level_reconstruction,
+        relative=relative_error(truth, distance),
+        peak=peak_error(distance),
+        node_sum=np.where(there, distance, 0).sum(axis=0),
+        node_count=there.sum(axis=0),
+        groups={name: group_error(distance, nodes) for name, nodes in groups.items()},
+    )
+
+
+def full_field(reference: Reference, predictor: Predictor, field: NDArray[np.floating]) -> NDArray[np.float32]:
+    """`field` (state, node of the predictor's level, 3) on the full mesh: (state, node, 3).
+
+    Raises EvaluationError where the predictor gave another shape than its level has.
+    """
+    expected = (len(reference.time), reference.level_nodes(predictor.level), 3)
+    if field.shape != expected:
+        raise EvaluationError(
+            f"gave an array of shape {field.shape}; expected {expected} on level {predictor.level} of this dataset; "
+            f"evaluate it with the dataset it was trained on"
+        )
+    if predictor.level == 0:
+        return np.asarray(field, dtype=np.float32)
+    return lift(field, reference.level(predictor.level).to_full)
+
+
+def _on_levels(reference: Reference, distance: NDArray[np.float64]) -> NDArray[np.float64]:
+    nodes = [np.arange(reference.n_nodes), *(level.kept for level in reference.levels)]
+    return group_error(distance, nodes)
+
+
+@dataclass(frozen=True)
+class Scores:
+    """One row of the comparison over all seeds and test runs; lengths in metres, as in RunScore.
+
+    e2, reconstruction, q95, largest    (seed, run, state)
+    on_level, on_level_reconstruction   (seed, run, level)
+    relative, peak_value, peak_state, peak_node  (seed, run)
+    node_mean                           (node,) over seeds, runs and states
+    groups                              grouping -> (seed, run, group)
+    """
+
+    e2: NDArray[np.float64]
+    reconstruction: NDArray[np.float64]
+    q95: NDArray[np.float64]
+    largest: NDArray[np.float64]
+    on_level: NDArray[np.float64]
+    on_level_reconstruction: NDArray[np.float64]
+    relative: NDArray[np.float64]
+    peak_value: NDArray[np.float64]
+    peak_state: NDArray[np.int64]
+    peak_node: NDArray[np.int64]
+    node_mean: NDArray[np.float64]
+    groups: Mapping[str, NDArray[np.float64]]
+
+    @property
+    def of_runs(self) -> NDArray[np.float64]:
+        """(run,) m: mean over time and seeds, the error by which runs are ranked."""
+        return masked_mean(self.e2, axis=(0, 2))
+
+    @property
+    def of_seeds(self) -> NDArray[np.float64]:
+        """(seed,) m: mean over time and test runs for each seed."""
+        return masked_mean(masked_mean(self.e2, axis=2), axis=1)
+
+    @property
+    def mean(self) -> float:
+        """The number in the table, m: mean over time, test runs and seeds."""
+        return float(self.of_seeds.mean())
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation over the seeds, m; NaN for a single seed."""
+        return float(self.of_seeds.std(ddof=1)) if len(self.of_seeds) > 1 else float("nan")
+
+    @property
+    def reduction(self) -> float:
+        """Mean over time, runs and seeds of the reconstruction error, m."""
+        return float(masked_mean(self.reconstruction))
+
+
+def gather(runs: Iterable[RunScores], keys: Sequence[Key]) -> Scores:
+    """Put the scores of the predictors `keys` (the seeds of one row) together, in the order of `runs`."""
+    table = [[r.scores[key] for r in runs] for key in keys] if (runs := list(runs)) else []
+    if not table:
+        raise EvaluationError("there are no scored runs; expected at least one test run")
+
+    def stack(name: str) -> NDArray[np.float64]:
+        return np.array([[getattr(s, name) for s in row] for row in table])
+
+    flat = [s for row in table for s in row]
+    count = np.sum([s.node_count for s in flat], axis=0)
+    total = np.sum([s.node_sum for s in flat], axis=0)
+    return Scores(
+        **{
+            name: stack(name)
+            for name in (
+                "e2", "reconstruction", "q95", "largest", "on_level", "on_level_reconstruction", "relative",
+            )
+        },
+        peak_value=np.array([[s.peak.value for s in row] for row in table]),
+        peak_state=np.array([[s.peak.state for s in row] for row in table]),
+        peak_node=np.array([[s.peak.node for s in row] for row in table]),
+        node_mean=np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0),
+        groups={name: np.array([[s.groups[name] for s in row] for row in table]) for name in flat[0].groups},
+    )  # fmt: skip

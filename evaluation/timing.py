@@ -1,0 +1,59 @@
+"""How long a prediction takes, with and without lifting it to the full mesh."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from evaluation.measures import lift
+from evaluation.predictor import Predictor
+from evaluation.reference import Reference
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Milliseconds a state, median of several repetitions on this machine.
+
+    own, lifted                on the predictor's own level and on the full mesh, all states of a run in one call
+    single, single_lifted      the same for one state alone, as an interactive viewer asks
+    """
+
+    own: float
+    lifted: float
+    single: float
+    single_lifted: float
+
+
+def time_predictions(reference: Reference, predictor: Predictor, run: int, repeats: int = 7) -> Timing:
+    """Ask `predictor` for run number `run` again and again; the first call is not counted."""
+    parameters, times = reference.parameters[run], reference.time
+    to_full = None if predictor.level == 0 else reference.level(predictor.level).to_full.astype("float32")
+
+    def ask(states: int, lifted: bool) -> Callable[[], None]:
+        def call() -> None:
+            field = predictor.predict(parameters, times[-states:])
+            if lifted and to_full is not None:
+                lift(field, to_full)
+
+        return call
+
+    states = len(times)
+    own, whole, single, one = (
+        _median_seconds(ask(n, lifted), repeats)
+        for n, lifted in ((states, False), (states, True), (1, False), (1, True))
+    )
+    if to_full is None:  # nothing to lift: one number, not two samples of the same noise
+        whole, one = own, single
+    return Timing(own / states * 1e3, whole / states * 1e3, single * 1e3, one * 1e3)
+
+
+def _median_seconds(call: Callable[[], None], repeats: int) -> float:
+    call()
+    seconds = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        call()
+        seconds.append(time.perf_counter() - start)
+    return statistics.median(seconds)

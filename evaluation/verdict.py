@@ -1,0 +1,294 @@
+"""What the numbers say, in words: which model for which purpose, and what not to believe.
+
+Every sentence follows from a rule stated here and printed in the report. Nothing is said that the numbers of
+this evaluation do not say; a model that loses is named as the one that loses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaluation.comparison import Entry
+from evaluation.figures.style import CM
+from evaluation.measures import masked_mean
+from evaluation.result import Evaluation
+
+FEW_RUNS = 10  # fewer test runs than this carry no reliable ranking of close models
+NEAR = 1.25  # "nearly as exact": at most a quarter worse than the best
+POOR_RELATIVE = 0.15  # a relative displacement error above this is called out
+
+RULES = (
+    f"Two models are told apart only if the 95 % interval of the mean difference of their errors over the test runs "
+    f"(paired bootstrap, 4000 resamples, fixed seed) leaves zero out. "
+    f"Most accurate: lowest mean node error on the full mesh. "
+    f"Many queries: the fastest on the full mesh among those at most {100 * (NEAR - 1):.0f} % worse than the best. "
+    f"Visualisation: among models that predict on a coarse mesh, the one with the fewest nodes at most "
+    f"{100 * (NEAR - 1):.0f} % worse than the best of these. "
+    f"Worst case: lowest error on its worst test run. "
+    f"A warning stands wherever there are fewer than {FEW_RUNS} test runs, a relative displacement error above "
+    f"{100 * POOR_RELATIVE:.0f} %, a group of nodes whose error exceeds half of its own motion, a finer level that is "
+    f"not better than the coarser one, or a baseline that is better than a multi-hierarchical model."
+)
+
+
+@dataclass(frozen=True)
+class Statement:
+    """`kind` is "use" (a recommendation), "finding" or "warning"; `about` its heading, `text` one or two sentences."""
+
+    kind: str
+    about: str
+    text: str
+
+
+def statements(evaluation: Evaluation) -> list[Statement]:
+    """The words of the report, recommendations first. See `RULES`."""
+    return [
+        *_use(evaluation),
+        *_error_source(evaluation),
+        *_families(evaluation),
+        *_levels(evaluation),
+        *_warnings(evaluation),
+    ]
+
+
+def difference(a: NDArray[np.float64], b: NDArray[np.float64], resamples: int = 4000) -> tuple[float, float, float]:
+    """Mean of `a - b` over runs (run,) and its 95 % interval by a paired bootstrap; seeded. One run: the interval
+    is infinite, since one run says nothing about the next."""
+    delta = np.asarray(a, dtype=np.float64) - np.asarray(b, dtype=np.float64)
+    if len(delta) < 2:
+        return float(delta.mean()), -np.inf, np.inf
+    draws = np.random.default_rng(0).integers(0, len(delta), (resamples, len(delta)))
+    low, high = np.quantile(delta[draws].mean(axis=1), (0.025, 0.975))
+    return float(delta.mean()), float(low), float(high)
+
+
+def clearly_better(evaluation: Evaluation, a: Entry, b: Entry) -> bool:
+    """Whether `a` has the lower error than `b` beyond what another choice of test runs would explain."""
+    return difference(evaluation.scores[a.label].of_runs, evaluation.scores[b.label].of_runs)[2] < 0
+
+
+def _cm(value: float) -> str:
+    return f"{value * CM:.2f} cm"
+
+
+def _error(evaluation: Evaluation, entry: Entry) -> float:
+    return evaluation.scores[entry.label].mean
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _use(evaluation: Evaluation) -> list[Statement]:
+    ranked = evaluation.ranked
+    best = ranked[0]
+    scores = evaluation.scores
+    relative = float(masked_mean(scores[best.label].relative))
+    equal = [e.label for e in ranked[1:] if not clearly_better(evaluation, best, e)]
+    text = (
+        f"{best.label}: mean node error {_cm(_error(evaluation, best))} on the full mesh, "
+        f"{100 * relative:.1f} % of the displacement"
+    )
+    if len(ranked) == 1:
+        text += ". There is no other model to compare it with."
+    elif equal:
+        text += f". {_listed(equal)} cannot be told apart from it on these {len(evaluation.runs)} test runs."
+    else:
+        text += f", ahead of {ranked[1].label} with {_cm(_error(evaluation, ranked[1]))}."
+    out = [Statement("use", "Highest accuracy", text)]
+    if evaluation.timings:
+        near = [e for e in ranked if _error(evaluation, e) <= NEAR * _error(evaluation, best)]
+        fast = min(near, key=lambda e: evaluation.timings[e.label].lifted)
+        ms = evaluation.timings[fast.label].lifted
+        out.append(
+            Statement(
+                "use",
+                "Many queries (optimisation, uncertainty)",
+                f"{fast.label}: {ms:.3g} ms a state on the full mesh at {_cm(_error(evaluation, fast))}"
+                + (
+                    ", the fastest of those nearly as exact as the best."
+                    if len(near) > 1
+                    else "; no other model comes within a quarter of its error."
+                ),
+            )
+        )
+    coarse = [e for e in ranked if e.level > 0]
+    if coarse:
+        limit = NEAR * _error(evaluation, coarse[0])
+        light = min(
+            (e for e in coarse if _error(evaluation, e) <= limit),
+            key=lambda e: evaluation.reference.level_nodes(e.level),
+        )
+        nodes, full = evaluation.reference.level_nodes(light.level), evaluation.reference.n_nodes
+        own = float(masked_mean(scores[light.label].on_level[..., light.level]))
+        out.append(
+            Statement(
+                "use",
+                "Visualisation on weak hardware",
+                f"{light.label}: {nodes} of {full} nodes, {_cm(own)} on its own nodes and "
+                f"{_cm(_error(evaluation, light))} lifted to the full mesh.",
+            )
+        )
+    if len(ranked) > 1 and len(evaluation.runs) > 1:
+        safe = min(ranked, key=lambda e: float(scores[e.label].of_runs.max()))
+        worst = int(np.argmax(scores[safe.label].of_runs))
+        out.append(
+            Statement(
+                "use",
+                "Smallest worst case",
+                f"{safe.label}: on its worst test run, {evaluation.test_names[worst]}, the mean node error is "
+                f"{_cm(float(scores[safe.label].of_runs[worst]))}; the largest error of any node at any time is "
+                f"{_cm(float(scores[safe.label].peak_value.max()))}.",
+            )
+        )
+    return out
+
+
+def _error_source(evaluation: Evaluation) -> list[Statement]:
+    best = evaluation.ranked[0]
+    s = evaluation.scores[best.label]
+    latent = evaluation.predictor(best).n_latent
+    floor = evaluation.floor_at(latent)
+    source = (
+        "Regression dominates: more runs or a better regression would help, more latent numbers hardly."
+        if s.reduction < 0.5 * s.mean
+        else (
+            "Reduction dominates: a larger latent space or a better reduction would help."
+            if s.reduction > 0.8 * s.mean
+            else "Reduction and regression both matter."
+        )
+    )
+    beside = f" A POD projection on {latent} modes costs {_cm(floor)}." if floor == floor else ""
+    return [
+        Statement(
+            "finding",
+            "Where the error comes from",
+            f"Of the {_cm(s.mean)} of {best.label}, {_cm(s.reduction)} remain when the truth itself is encoded and "
+            f"decoded.{beside} {source}",
+        )
+    ]
+
+
+def _families(evaluation: Evaluation) -> list[Statement]:
+    """Multi-hierarchical models against the best model of the full mesh, win or lose."""
+    coarse = [e for e in evaluation.ranked if e.level > 0]
+    full = [e for e in evaluation.ranked if e.level == 0]
+    if not coarse or not full:
+        return []
+    rival = full[0]
+    ours = coarse[0]
+    delta, low, high = difference(evaluation.scores[ours.label].of_runs, evaluation.scores[rival.label].of_runs)
+    wins = int((evaluation.scores[ours.label].of_runs < evaluation.scores[rival.label].of_runs).sum())
+    count = len(evaluation.runs)
+    numbers = f"{_cm(_error(evaluation, ours))} against {_cm(_error(evaluation, rival))}, better on {wins} of {count} test runs"
+    spread = f"95 % interval {low * CM:+.2f} to {high * CM:+.2f}"
+    interval = f" (difference {delta * CM:+.2f} cm, {spread})" if count > 1 else ""
+    about = "Multi-hierarchical against the best baseline"
+    if high < 0:
+        return [Statement("finding", about, f"{ours.label} beats {rival.label}: {numbers}{interval}.")]
+    if low > 0:
+        return [
+            Statement(
+                "warning",
+                about,
+                f"{ours.label}, the best multi-hierarchical level, loses to {rival.label}: {numbers}{interval}. For "
+                f"accuracy on the full mesh, {rival.label} is the better choice here.",
+            )
+        ]
+    return [Statement("finding", about, f"{ours.label} and {rival.label} cannot be told apart: {numbers}{interval}.")]
+
+
+def _levels(evaluation: Evaluation) -> list[Statement]:
+    """Whether each finer level of a cascade is better than the next coarser one."""
+    out = []
+    for m in range(len(evaluation.models)):
+        rows = [e for e in evaluation.entries if e.keys[0][0] == m]
+        rows.sort(key=lambda e: -e.level)
+        if len(rows) < 2:
+            continue
+        values = [_error(evaluation, e) for e in rows]
+        said = ", ".join(f"{e.label} {_cm(v)}" for e, v in zip(rows, values, strict=True))
+        worse = [
+            f"{fine.label} is not better than {coarse.label}"
+            for coarse, fine, a, b in zip(rows, rows[1:], values, values[1:], strict=False)
+            if b >= a
+        ]
+        if worse:
+            out.append(Statement("warning", "Levels", f"{said}: {_listed(worse)}. Refinement did not pay there."))
+        else:
+            out.append(Statement("finding", "Levels", f"The error falls with every refinement: {said}."))
+    return out
+
+
+def _warnings(evaluation: Evaluation) -> list[Statement]:
+    out = []
+    count = len(evaluation.runs)
+    if count == 1:
+        out.append(
+            Statement(
+                "warning",
+                "One test run",
+                "All numbers come from a single test run. They describe this run and say nothing about the next one; "
+                "no ranking of models should be built on them.",
+            )
+        )
+    elif count < FEW_RUNS:
+        out.append(
+            Statement(
+                "warning",
+                "Few test runs",
+                f"There are {count} test runs. Differences smaller than the spread between runs mean little.",
+            )
+        )
+    if all(len(e.keys) == 1 for e in evaluation.entries):
+        out.append(
+            Statement(
+                "warning",
+                "One seed each",
+                "Every model was trained once. Another seed gives another number; train with several seeds to see how "
+                "much of a difference is luck.",
+            )
+        )
+    poor = [
+        f"{e.label} {100 * float(masked_mean(evaluation.scores[e.label].relative)):.0f} %"
+        for e in evaluation.ranked
+        if float(masked_mean(evaluation.scores[e.label].relative)) > POOR_RELATIVE
+    ]
+    if poor:
+        out.append(
+            Statement(
+                "warning",
+                "Large relative error",
+                f"Relative displacement error: {_listed(poor)}. Good for trends, not for values at a node.",
+            )
+        )
+    best = evaluation.ranked[0]
+    for what, names in evaluation.group_names.items():
+        errors = masked_mean(evaluation.scores[best.label].groups[what], axis=(0, 1))
+        sizes = masked_mean(np.array([r.group_size[what] for r in evaluation.runs]), axis=0)
+        bad = [f"{name} ({_cm(e)} of {_cm(s)})" for name, e, s in zip(names, errors, sizes, strict=True) if e > 0.5 * s]
+        if bad:
+            out.append(
+                Statement(
+                    "warning",
+                    f"By {what}",
+                    f"{best.label} misses more than half of the motion of {_listed(bad[:5])}.",
+                )
+            )
+    worst = evaluation.scores[best.label].of_runs
+    if count > 2 and worst.max() > 2 * np.median(worst):
+        run = int(np.argmax(worst))
+        out.append(
+            Statement(
+                "warning",
+                "An outlier",
+                f"On run {evaluation.test_names[run]} the error of {best.label} is "
+                f"{worst.max() / np.median(worst):.1f} times "
+                f"that of a typical run; look at its place in the design space below.",
+            )
+        )
+    return out
