@@ -1,0 +1,247 @@
+"""One run in three dimensions inside a web page: truth beside prediction, with a time slider, without a network.
+
+The page is what PyVista's export makes: the scene as VTK.js reads it, in the viewer that comes with trame-vtk
+(the `viewer` extra). PyVista's own function starts a web server to get there; here the same exporter is called
+directly. The exported scene holds one state; the others travel beside it as 16-bit positions, and a few lines of
+script move the points when the slider moves.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import os
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evaluation.errors import EvaluationError
+from evaluation.pictures import DISPLACEMENT, ERROR
+from evaluation.rendering import choose_view, off_screen
+
+MAX_NODES = 10_000
+MAX_STATES = 31
+_STEPS = 2**16 - 1
+_COLOURS = 64
+
+
+def interactive_view(
+    points: ArrayLike,
+    faces: ArrayLike,
+    time: ArrayLike,
+    truth: ArrayLike,
+    prediction: ArrayLike,
+    path: str | os.PathLike[str] | None = None,
+    *,
+    names: tuple[str, str] = ("truth", "prediction"),
+    title: str = "truth and prediction",
+    alive: ArrayLike | None = None,
+    max_nodes: int = MAX_NODES,
+    max_states: int = MAX_STATES,
+) -> str:
+    """A whole HTML page that shows one run; also written to `path` unless that is None.
+
+    points      (n, 3) reference position, m
+    faces       (m, 3 or 4), -1 in the last corner of a triangle
+    time        (t,) s
+    truth, prediction  (t, n, 3) displacements, m; NaN where nodes are gone
+    alive       (t, m) bool, False once an element has eroded
+
+    The size is bounded: a mesh of more than `max_nodes` nodes is shown on that many of them, chosen as the mesh
+    hierarchy chooses them, and of more than `max_states` states as many, evenly spread, with first and last.
+    Positions are rounded to 1/65535 of the space the run takes. Errors named in the page are those of all nodes.
+    Raises EvaluationError where arrays do not belong together, the extra is missing or nothing can be drawn.
+    """
+    x, corners, times = np.asarray(points, np.float64), np.asarray(faces), np.asarray(time, np.float64)
+    u, p = np.asarray(truth), np.asarray(prediction)
+    if not u.shape == p.shape == (len(times), *x.shape):
+        raise EvaluationError(
+            f"truth {u.shape} and prediction {p.shape}: expected {len(times)} states of {len(x)} nodes x 3"
+        )
+    chosen = np.unique(np.round(np.linspace(0, len(times) - 1, min(max_states, len(times)))).astype(int))
+    u, p = np.asarray(u[chosen], np.float64), np.asarray(p[chosen], np.float64)
+    living = np.ones((len(chosen), len(corners)), bool) if alive is None else np.asarray(alive, bool)[chosen]
+    errors = [_errors(a, b, len(x) > max_nodes) for a, b in zip(u, p, strict=True)]
+
+    x, corners, u, p, living = _triangles(*_thinned(x, corners, u, p, living, max_nodes))
+    there = np.asarray(np.isfinite(u).all(axis=-1))
+    living &= there[:, corners].all(axis=-1)
+    both = np.concatenate([x[None], x + _held(u), x[None], x + _held(p)])
+    origin = both.min(axis=(0, 1))
+    step = np.maximum(both.max(axis=(0, 1)) - origin, 1e-9) / _STEPS
+    steps = np.round((both - origin) / step).astype(np.uint16)
+    half = len(both) // 2
+    view = choose_view([both], corners)
+    eye = np.cross(view.right, view.up)
+    distance = 10 * max(view.width, view.height)
+    run = {
+        "nodes": len(x),
+        "time": times[chosen].tolist(),
+        "first": len(chosen) - 1,
+        "names": names,
+        "origin": origin.tolist(),
+        "step": step.tolist(),
+        "truth": _packed(steps[:half]),
+        "prediction": _packed(steps[half:]),
+        "shown": "" if living.all() else _deflated(np.packbits(living).tobytes()),
+        "limits": [_limit(u, p), _limit(p - u)],
+        "colours": [_colours(DISPLACEMENT), _colours(ERROR)],
+        "errors": errors,
+        "view": {
+            "centre": view.centre.tolist(),
+            "position": (view.centre + distance * eye).tolist(),
+            "up": view.up.tolist(),
+            "width": view.width,
+            "height": view.height,
+        },
+    }
+    page = _page(_exported(x, corners), run, title)
+    if path is not None:
+        Path(path).write_text(page, encoding="utf-8")
+    return page
+
+
+def _errors(truth: NDArray[np.float64], prediction: NDArray[np.float64], thinned: bool) -> str:
+    error = 100 * np.linalg.norm(prediction - truth, axis=-1)
+    error = error[np.isfinite(error)]
+    if not error.size:
+        return "no node left"
+    of = "all nodes, more than are shown" if thinned else "all nodes"
+    return f"error over {of}: mean {error.mean():.2f} cm, largest {error.max():.2f} cm"
+
+
+def _limit(*fields: NDArray[np.float64]) -> float:
+    """The largest length in cm, for a colour bar from zero."""
+    return max(1e-9, max(float(np.nanmax(100 * np.linalg.norm(f, axis=-1), initial=0.0)) for f in fields))
+
+
+def _held(displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Displacements (t, n, 3) in which a node that is gone stays where it was last; its faces are hidden."""
+    held = displacement.copy()
+    for k in range(len(held)):
+        before = held[k - 1] if k else np.zeros_like(held[0])
+        held[k] = np.where(np.isfinite(held[k]), held[k], before)
+    return held
+
+
+def _thinned(
+    x: NDArray[np.float64],
+    corners: NDArray[Any],
+    u: NDArray[np.float64],
+    p: NDArray[np.float64],
+    living: NDArray[np.bool_],
+    max_nodes: int,
+) -> tuple[NDArray[np.float64], NDArray[Any], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    if len(x) <= max_nodes:
+        return x, corners, u, p, living
+    from crashkit.mesh.hierarchy import build_hierarchy
+
+    level = build_hierarchy(x, corners, [max_nodes])[1]
+    kept = level.kept
+    # A coarse face stands for many; it is shown as long as its nodes are there.
+    return x[kept], level.faces, u[:, kept], p[:, kept], np.ones((len(u), len(level.faces)), bool)
+
+
+def _triangles(
+    x: NDArray[np.float64],
+    corners: NDArray[Any],
+    u: NDArray[np.float64],
+    p: NDArray[np.float64],
+    living: NDArray[np.bool_],
+) -> tuple[NDArray[np.float64], NDArray[Any], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    if corners.shape[1] == 3:
+        return x, corners, u, p, living
+    quads = np.flatnonzero(corners[:, 3] >= 0)
+    triangles = np.concatenate([corners[:, :3], corners[quads][:, [0, 2, 3]]])
+    return x, triangles, u, p, np.concatenate([living, living[:, quads]], axis=1)
+
+
+def _packed(steps: NDArray[np.uint16]) -> str:
+    """Differences from state to state, low bytes before high bytes: what deflate makes least of."""
+    differences = np.diff(steps, axis=0, prepend=np.zeros_like(steps[:1])).ravel()
+    return _deflated((differences & 0xFF).astype(np.uint8).tobytes() + (differences >> 8).astype(np.uint8).tobytes())
+
+
+def _deflated(data: bytes) -> str:
+    return base64.b64encode(zlib.compress(data, 9)).decode("ascii")
+
+
+def _colours(name: str) -> list[int]:
+    """`_COLOURS` colours as r, g, b, r, g, b, .. of 0 to 255."""
+    from matplotlib import colormaps
+
+    return (colormaps[name](np.linspace(0, 1, _COLOURS))[:, :3] * 255).round().astype(int).ravel().tolist()
+
+
+def _exported(x: NDArray[np.float64], triangles: NDArray[Any]) -> bytes:
+    """The scene as a VTK.js file: truth on the left; prediction, with the truth as grey lines, on the right."""
+    import pyvista as pv
+
+    try:
+        import vtkmodules.vtkWebCore  # noqa: F401 - what trame-vtk serializes with
+        from trame_vtk.modules.vtk import serializers
+    except ImportError as error:
+        raise EvaluationError(
+            f"the interactive view needs the package {error.name}: install it with pip install 'crashkit[viewer]'"
+        ) from error
+    with off_screen():
+        plotter: Any = pv.Plotter(off_screen=True, shape=(1, 2), window_size=[64, 32], border=False)
+        try:
+            for side in range(2):
+                plotter.subplot(0, side)
+                plotter.set_background("white")
+                mesh: Any = pv.PolyData.from_regular_faces(x, triangles)
+                mesh["rgb"] = np.zeros((len(x), 3), np.uint8)
+                plotter.add_mesh(mesh, scalars="rgb", rgb=True, smooth_shading=False, ambient=0.3, diffuse=0.75)
+            shadow: Any = pv.PolyData.from_regular_faces(x, triangles)
+            # Lines, since VTK.js draws what is translucent across both halves of the window.
+            plotter.add_mesh(shadow, color="#b4b8be", style="wireframe", line_width=1, lighting=False)
+            plotter.render()
+            window = plotter.render_window
+            serializers.initialize_serializers()
+            context = serializers.SynchronizationContext()
+            scene = serializers.serialize(None, window, serializers.reference_id(window), context, 1)
+            camera = plotter.renderers[0].camera
+            scene["extra"] = {
+                "vtkRefId": serializers.reference_id(window),
+                "centerOfRotation": camera.focal_point,
+                "camera": serializers.reference_id(camera),
+            }
+            hashes = {
+                entry["hash"]: {**entry, "content": context.get_cached_data_array(entry["hash"], False)}
+                for entry in serializers.extract_array_hash(scene)
+            }
+        finally:
+            plotter.close()
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("index.json", json.dumps({"hashes": hashes, "scene": scene}))
+    return packed.getvalue()
+
+
+def _page(scene: bytes, run: Mapping[str, Any], title: str) -> str:
+    """The viewer's page around `scene`, with the controls of `templates/viewer.html`."""
+    from html import escape
+    from importlib.resources import files
+
+    from jinja2 import Template
+    from trame_vtk.tools.vtksz2html import write_html
+
+    out = io.StringIO()
+    write_html(scene, out)
+    page = out.getvalue()
+    template = files("evaluation").joinpath("templates/viewer.html").read_text(encoding="utf-8")
+    controls = Template(template).render(run=json.dumps(run, separators=(",", ":")).replace("<", "\\u003c"))
+    head, body, rest = page.partition("<body>")
+    start, _, end = head.partition("<title>")
+    load = "function loadDataSet() {"
+    if not body or "</title>" not in end or load not in rest:
+        raise EvaluationError("the viewer of this trame-vtk is not the page expected: install trame-vtk 2.11")
+    head = f"{start}<title>{escape(title)}{end[end.index('</title>') :]}"
+    return head + body + controls + rest.replace(load, load + " if (window.withoutView) return;", 1)
