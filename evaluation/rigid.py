@@ -1,0 +1,167 @@
+"""Rigid-body motion apart from deformation, so that a good rigid motion cannot hide a bad crush.
+
+Every state is fitted by the rotation R and the translation that bring the undeformed nodes x closest to their
+present positions y in the sense of least squares (Kabsch 1976, Acta Crystallographica A32; by singular values and
+with the sign of Umeyama 1991, so that R never mirrors):
+
+    y_i = R (x_i - c) + c + T + R d_i
+
+with c the centroid of x. What is left, d_i, is the deformation as somebody sees it who moves with the body. Nodes
+that are gone (NaN) take no part in the fit of their state. Lengths are metres everywhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evaluation.errors import EvaluationError
+from evaluation.measures import masked_mean
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RigidMotion:
+    """The best-fitting rigid motion of each state; NaN where fewer than three nodes are left.
+
+    rotation     (t, 3, 3) proper rotations R
+    translation  (t, 3) T, m: how far the centroid of the undeformed nodes is carried
+    centre       (3,) c, m
+    """
+
+    rotation: Floats
+    translation: Floats
+    centre: Floats
+
+    def displacement(self, position: ArrayLike) -> Floats:
+        """Displacements (t, n, 3), m, of nodes at `position` (n, 3), m, if they only moved with the body."""
+        arm = np.asarray(position, np.float64) - self.centre
+        return np.einsum("tij,nj->tni", self.rotation, arm) + self.translation[:, None] - arm
+
+    def deformation(self, position: ArrayLike, displacement: ArrayLike) -> Floats:
+        """What is left of `displacement` (t, n, 3), m, seen by somebody who moves with the body: d, (t, n, 3), m."""
+        rest = np.asarray(displacement, np.float64) - self.displacement(position)
+        return np.einsum("tji,tnj->tni", self.rotation, rest)
+
+    @property
+    def angle(self) -> Floats:
+        """(t,) angle of rotation in degrees, 0 to 180."""
+        return _angle(self.rotation)
+
+
+def fit_rigid(position: ArrayLike, displacement: ArrayLike, nodes: ArrayLike | None = None) -> RigidMotion:
+    """The rigid motion of `displacement` (t, n, 3), m, of nodes at `position` (n, 3), m.
+
+    `nodes` are the numbers of those nodes that count (a seat, a cross member); all of them by default.
+    Raises EvaluationError for arrays that do not fit or fewer than three nodes.
+    """
+    x, u = _checked(position, displacement)
+    if nodes is not None:
+        x, u = x[np.asarray(nodes)], u[:, np.asarray(nodes)]
+    if len(x) < 3:
+        raise EvaluationError(f"a rigid motion asked for of {len(x)} nodes: expected at least three")
+    centre = x.mean(axis=0)
+    rotation = np.full((len(u), 3, 3), np.nan)
+    translation = np.full((len(u), 3), np.nan)
+    for k, state in enumerate(u):
+        there = np.isfinite(state).all(axis=1)
+        if there.sum() < 3:
+            continue
+        before, after = x[there], x[there] + state[there].astype(np.float64)
+        middle, moved = before.mean(axis=0), after.mean(axis=0)
+        rotation[k] = _rotation(before - middle, after - moved)
+        translation[k] = moved - centre - rotation[k] @ (middle - centre)
+    return RigidMotion(rotation, translation, centre)
+
+
+def _rotation(before: Floats, after: Floats) -> Floats:
+    """The proper rotation R (3, 3) with the least sum of squares of after - R before."""
+    left, _, right = np.linalg.svd(after.T @ before)
+    sign = np.array([1.0, 1.0, np.linalg.det(left) * np.linalg.det(right)])
+    return (left * np.sign(sign)) @ right
+
+
+@dataclass(frozen=True)
+class SplitError:
+    """Errors of a prediction by kind, one value a state (t,); all but `rotation` in m.
+
+    translation       distance between the predicted and the true translation of the body
+    rotation          angle between the predicted and the true rotation, degrees
+    rigid             mean over nodes of the distance between predicted and true rigid displacement
+    deformation       mean over nodes of the distance between predicted and true deformation: the crush alone
+    total             mean node error; not the sum of the two, since they may point in opposite directions
+    true_rigid, true_deformation   mean sizes of what is predicted
+    """
+
+    translation: Floats
+    rotation: Floats
+    rigid: Floats
+    deformation: Floats
+    total: Floats
+    true_rigid: Floats
+    true_deformation: Floats
+
+
+def split_error(
+    position: ArrayLike, truth: ArrayLike, prediction: ArrayLike, nodes: ArrayLike | None = None
+) -> SplitError:
+    """Errors of `prediction` against `truth` (t, n, 3), m, in rigid motion and in deformation.
+
+    position  (n, 3) undeformed, m
+    nodes     the nodes whose motion is the body's; all by default
+
+    Nodes that are gone in `truth` (NaN) are left out on both sides. Raises EvaluationError where arrays do not fit
+    or the prediction is not finite at a node that is there.
+    """
+    x, u = _checked(position, truth)
+    _, p = _checked(position, prediction)
+    if u.shape != p.shape:
+        raise EvaluationError(f"truth has shape {u.shape} and the prediction {p.shape}: expected the same (t, n, 3)")
+    there = np.isfinite(u).all(axis=-1)
+    bad = there & ~np.isfinite(p).all(axis=-1)
+    if bad.any():
+        state, node = np.argwhere(bad)[0]
+        raise EvaluationError(f"the prediction is not finite in state {state} at node {node}: expected numbers there")
+    p = np.where(there[..., None], p, np.nan)
+    true, predicted = fit_rigid(x, u, nodes), fit_rigid(x, p, nodes)
+    rigid_true = np.where(there[..., None], true.displacement(x), np.nan)
+    deformation_true = true.deformation(x, u)
+    return SplitError(
+        translation=np.linalg.norm(predicted.translation - true.translation, axis=-1),
+        rotation=_angle(np.einsum("tij,tkj->tik", predicted.rotation, true.rotation)),
+        rigid=_mean_length(predicted.displacement(x) - rigid_true),
+        deformation=_mean_length(predicted.deformation(x, p) - deformation_true),
+        total=_mean_length(p - u),
+        true_rigid=_mean_length(rigid_true),
+        true_deformation=_mean_length(deformation_true),
+    )
+
+
+def _mean_length(field: NDArray[np.floating]) -> Floats:
+    return masked_mean(np.linalg.norm(field, axis=-1), axis=-1)
+
+
+def _angle(rotation: Floats) -> Floats:
+    """Degrees; by the arc tangent of sine and cosine, which is exact for small angles too."""
+    twice_sine = np.stack(
+        [
+            rotation[:, 2, 1] - rotation[:, 1, 2],
+            rotation[:, 0, 2] - rotation[:, 2, 0],
+            rotation[:, 1, 0] - rotation[:, 0, 1],
+        ],
+        axis=-1,
+    )
+    twice_cosine = np.trace(rotation, axis1=1, axis2=2) - 1
+    return np.degrees(np.arctan2(np.linalg.norm(twice_sine, axis=-1), twice_cosine))
+
+
+def _checked(position: ArrayLike, displacement: ArrayLike) -> tuple[Floats, NDArray[np.floating]]:
+    x, u = np.asarray(position, np.float64), np.asarray(displacement)
+    if x.ndim != 2 or x.shape[1] != 3 or u.ndim != 3 or u.shape[1:] != x.shape:
+        raise EvaluationError(
+            f"positions have shape {x.shape} and displacements {u.shape}: expected (n, 3) and (t, n, 3) on one mesh"
+        )
+    return x, u
