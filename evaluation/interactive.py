@@ -69,9 +69,9 @@ def interactive_view(
     living = np.ones((len(chosen), len(corners)), bool) if alive is None else np.asarray(alive, bool)[chosen]
     errors = [_errors(a, b, len(x) > max_nodes) for a, b in zip(u, p, strict=True)]
 
-    x, corners, u, p, living = _triangles(*_thinned(x, corners, u, p, living, max_nodes))
+    x, corners, u, p, living = _thinned(x, corners, u, p, living, max_nodes)
     there = np.asarray(np.isfinite(u).all(axis=-1))
-    living &= there[:, corners].all(axis=-1)
+    corners, living = _triangles(corners, living & (there[:, corners] | (corners < 0)).all(axis=-1))
     both = np.concatenate([x[None], x + _held(u), x[None], x + _held(p)])
     origin = both.min(axis=(0, 1))
     step = np.maximum(both.max(axis=(0, 1)) - origin, 1e-9) / _STEPS
@@ -148,18 +148,13 @@ def _thinned(
     return x[kept], level.faces, u[:, kept], p[:, kept], np.ones((len(u), len(level.faces)), bool)
 
 
-def _triangles(
-    x: NDArray[np.float64],
-    corners: NDArray[Any],
-    u: NDArray[np.float64],
-    p: NDArray[np.float64],
-    living: NDArray[np.bool_],
-) -> tuple[NDArray[np.float64], NDArray[Any], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+def _triangles(corners: NDArray[Any], living: NDArray[np.bool_]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """Faces (m, 3 or 4) as triangles, and which of them live (t, m)."""
     if corners.shape[1] == 3:
-        return x, corners, u, p, living
+        return corners, living
     quads = np.flatnonzero(corners[:, 3] >= 0)
     triangles = np.concatenate([corners[:, :3], corners[quads][:, [0, 2, 3]]])
-    return x, triangles, u, p, np.concatenate([living, living[:, quads]], axis=1)
+    return triangles, np.concatenate([living, living[:, quads]], axis=1)
 
 
 def _packed(steps: NDArray[np.uint16]) -> str:
