@@ -26,7 +26,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from crashkit.errors import DataError, OutputError
+from crashkit.errors import DataError, OutputError, ReadError
 
 if TYPE_CHECKING:
     import h5py
@@ -88,18 +88,20 @@ def write_paraview(
     """
     times = _times(time)
     mesh = _mesh(points, faces, lines)
-    cells = dict(cell_data or {})
-    if alive is not None:
-        cells |= _life(alive, times.size, mesh)
+    faces_shape = (times.size, mesh.n_cells - mesh.n_lines)
+    if alive is not None and np.shape(alive) != faces_shape:
+        raise DataError(
+            f"alive has shape {np.shape(alive)}: expected {faces_shape[0]} states and {faces_shape[1]} faces"
+        )
     fixed_points, moving_points = _sort(point_data or {}, times.size, mesh.n_points, "points")
-    fixed_cells, moving_cells = _sort(cells, times.size, mesh.n_cells, "cells")
+    fixed_cells, moving_cells = _sort(cell_data or {}, times.size, mesh.n_cells, "cells")
 
     def states() -> Iterator[State]:
         for k in range(times.size):
-            yield State(
-                {name: np.asarray(values[k]) for name, values in moving_points.items()},
-                {name: np.asarray(values[k]) for name, values in moving_cells.items()},
-            )
+            cells = {name: np.asarray(values[k]) for name, values in moving_cells.items()}
+            if alive is not None:
+                cells |= _life(alive[k], mesh)
+            yield State({name: np.asarray(values[k]) for name, values in moving_points.items()}, cells)
 
     return _write(path, mesh, times, states(), State(fixed_points, fixed_cells), units or {}, deform)
 
@@ -125,6 +127,37 @@ def write_states(
     """
     mesh = _mesh(points, faces, lines)
     return _write(path, mesh, _times(time), states, constant or State({}), units or {}, deform)
+
+
+def read_state(path: str | os.PathLike[str], state: int = -1) -> tuple[float, Any]:
+    """Time (s) and mesh, a `pyvista.UnstructuredGrid`, of one state of a `.pvd` or `.vtkhdf` file, through VTK.
+
+    `state` counts from 0, or back from -1. Raises ReadError for files that are neither, and states they lack.
+    """
+    import pyvista as pv
+    from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
+    from vtkmodules.vtkIOHDF import vtkHDFReader
+
+    source = Path(path)
+    hdf = source.suffix.lower() == ".vtkhdf"
+    if not source.is_file() or not (hdf or source.suffix.lower() == ".pvd"):
+        raise ReadError(f"{source}: expected a .pvd or .vtkhdf file that is there")
+    if hdf:
+        reader = vtkHDFReader()
+        reader.SetFileName(os.fspath(source))
+        reader.UpdateInformation()
+        times = reader.GetOutputInformation(0).Get(vtkStreamingDemandDrivenPipeline.TIME_STEPS()) or ()
+    else:
+        listed: Any = pv.PVDReader(os.fspath(source))
+        times = tuple(listed.time_values)
+    if not -len(times) <= state < len(times):
+        raise ReadError(f"{source}: state {state} asked for; it has {len(times)} states")
+    time = float(times[state])
+    if not hdf:
+        listed.set_active_time_value(time)
+        return time, listed.read()[0]
+    reader.UpdateTimeStep(time)
+    return time, pv.wrap(reader.GetOutputDataObject(0))
 
 
 # --- what is written -------------------------------------------------------------------------------------------
@@ -185,12 +218,9 @@ def _times(time: ArrayLike) -> NDArray[np.float64]:
     return times
 
 
-def _life(alive: Any, states: int, mesh: _Mesh) -> dict[str, NDArray[np.uint8]]:
-    life = np.asarray(alive, bool)
-    faces = mesh.n_cells - mesh.n_lines
-    if life.shape != (states, faces):
-        raise DataError(f"alive has shape {life.shape}: expected {states} states and {faces} faces")
-    life = np.concatenate([life, np.ones((states, mesh.n_lines), bool)], axis=1)
+def _life(alive: ArrayLike, mesh: _Mesh) -> dict[str, NDArray[np.uint8]]:
+    """Cell arrays of one state from `alive` (m,) of its faces; lines always live."""
+    life = np.concatenate([np.asarray(alive, bool), np.ones(mesh.n_lines, bool)])
     return {"alive": life.astype(np.uint8), "vtkGhostType": np.where(life, 0, _HIDDEN_CELL).astype(np.uint8)}
 
 

@@ -6,6 +6,7 @@ come from `evaluation.rendering`, so nothing here needs a display.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -135,6 +136,37 @@ def comparison_picture(
     ]
     rows = [[panel] for panel in panels] if sheet.narrow else [panels]
     return _sheet_of(rows, [moved, wrong], sheet, below=True)
+
+
+def file_picture(
+    path: str | os.PathLike[str],
+    state: int = -1,
+    name: str = "prediction",
+    sheet: Sheet | None = None,
+    truth: str = "displacement",
+    prediction: str = "predicted",
+) -> Figure:
+    """The comparison of one state of a ParaView file (`.pvd` or `.vtkhdf`), read back through VTK.
+
+    truth, prediction  names of the point arrays (n, 3), m, in the file; its points are undeformed
+    """
+    from crashkit.paraview import read_state
+
+    _, mesh = read_state(path, state)
+    missing = [array for array in (truth, prediction) if array not in mesh.point_data]
+    if missing:
+        found = ", ".join(mesh.point_data.keys()) or "none"
+        raise EvaluationError(f"{path}: no point array {missing[0]!r}; expected it among those there: {found}")
+    by_type = mesh.cells_dict
+    alive = mesh.cell_data.get("alive", np.ones(mesh.n_cells)).astype(bool)
+    faces = np.full((mesh.n_cells, 4), -1)
+    for kind, corners in by_type.items():
+        if corners.shape[1] in (3, 4):
+            faces[mesh.celltypes == kind, : corners.shape[1]] = corners
+    surface = faces[:, 2] >= 0
+    return comparison_picture(
+        mesh.points, faces[surface], mesh[truth], mesh[prediction], name, sheet, alive=alive[surface]
+    )
 
 
 def states_picture(
@@ -291,9 +323,3 @@ def _bar(axes: Axes, scale: Scale, orientation: str) -> None:
         bar.set_label(scale.label)
     axes.tick_params(length=2)
     axes.grid(False)
-
-
-__all__ = [
-    "KeptNodes", "Panel", "Row", "Scale", "comparison_picture", "field_picture", "kept_nodes_picture", "limits_of",
-    "states_at", "states_picture", "to_png",
-]  # fmt: skip

@@ -21,8 +21,8 @@ from vtkmodules.vtkCommonCore import vtkDataArray
 from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
 from vtkmodules.vtkIOHDF import vtkHDFReader
 
-from crashkit.errors import DataError, OutputError
-from crashkit.paraview import State, write_paraview, write_states
+from crashkit.errors import DataError, OutputError, ReadError
+from crashkit.paraview import State, read_state, write_paraview, write_states
 
 # A square and a triangle on one edge, and two lone edges: everything a mesh of ours can hold.
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0.5, 0], [3, 0.5, 1]], float)
@@ -143,13 +143,14 @@ def test_one_state_keeps_cells_units_and_time(tmp_path, suffix):
     assert unit == "m"
 
 
-def test_eroded_faces_are_hidden_and_their_nodes_stay_where_they_were(tmp_path):
+@pytest.mark.parametrize("suffix", [".pvd", ".vtkhdf"])
+def test_eroded_faces_are_hidden_and_their_nodes_stay_where_they_were(tmp_path, suffix):
     u = np.zeros((3, 6, 3))
     u[:, :, 0] = np.array([0.0, 0.1, 0.2])[:, None]
     u[2, 4] = np.nan
     alive = np.array([[True, True], [True, True], [True, False]])
     written = write_paraview(
-        tmp_path / "run.pvd", POINTS, FACES, TIME, {"displacement": u}, alive=alive, deform=True, lines=LINES
+        tmp_path / f"run{suffix}", POINTS, FACES, TIME, {"displacement": u}, alive=alive, deform=True, lines=LINES
     )
     _, states = read(written[0])
     last = list(states)[-1]
@@ -189,6 +190,19 @@ def test_states_that_do_not_fit_leave_the_old_file_alone(tmp_path, suffix, level
         write_states(path, POINTS, FACES, TIME, (State({"level": np.zeros((6, k))}) for k in levels))
     assert path.read_bytes() == content
     assert sorted(p.name for p in tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("suffix", [".pvd", ".vtkhdf"])
+def test_one_state_can_be_asked_for(tmp_path, suffix):
+    path = write_paraview(tmp_path / f"run{suffix}", POINTS, FACES, TIME, {"level": np.arange(18.0).reshape(3, 6)})[0]
+    for state in (0, 1, -1):
+        time, mesh = read_state(path, state)
+        assert time == TIME[state]
+        np.testing.assert_array_equal(mesh["level"], np.arange(18.0).reshape(3, 6)[state])
+    with pytest.raises(ReadError, match="state 3 asked for; it has 3 states"):
+        read_state(path, 3)
+    with pytest.raises(ReadError, match=r"expected a \.pvd or \.vtkhdf file that is there"):
+        read_state(tmp_path / "missing.pvd")
 
 
 def test_a_shorter_run_replaces_all_states_of_the_longer_one(tmp_path):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from crashkit.paraview import write_paraview
 from evaluation.errors import EvaluationError
 from evaluation.figures.style import Sheet
 from evaluation.pictures import (
@@ -17,6 +18,7 @@ from evaluation.pictures import (
     Row,
     comparison_picture,
     field_picture,
+    file_picture,
     kept_nodes_picture,
     limits_of,
     states_at,
@@ -65,6 +67,24 @@ def test_truth_and_prediction_share_a_scale_and_the_error_has_its_own(run):
     }
     shapes = {axes.images[0].get_array().shape for axes in figure.axes if axes.images}
     assert len(shapes) == 1
+
+
+@pytest.mark.parametrize("suffix", [".pvd", ".vtkhdf"])
+def test_a_picture_of_a_paraview_file_is_that_of_its_arrays(run, tmp_path, suffix):
+    u, p = run["truth"], run["other"]
+    alive = np.ones((len(run["time"]), len(run["faces"])), bool)
+    alive[10:, :900] = False
+    path = write_paraview(
+        tmp_path / f"run{suffix}", run["points"], run["faces"], run["time"], {"displacement": u, "predicted": p},
+        lines=[[0, 1]], alive=alive,
+    )[0]  # fmt: skip
+    of_file = file_picture(path, 12, "MH1", SHEET)
+    of_arrays = comparison_picture(run["points"], run["faces"], u[12], p[12], "MH1", SHEET, alive=alive[12])
+    assert texts(of_file) == texts(of_arrays)
+    for a, b in zip(of_file.axes[:3], of_arrays.axes[:3], strict=True):
+        np.testing.assert_array_equal(a.images[0].get_array(), b.images[0].get_array())
+    with pytest.raises(EvaluationError, match="no point array 'MH2'; expected it among those there: displacement"):
+        file_picture(path, prediction="MH2")
 
 
 def test_a_perfect_prediction_is_drawn_too(run):
