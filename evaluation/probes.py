@@ -63,7 +63,7 @@ def differentiate(time: ArrayLike, values: ArrayLike) -> Floats:
 
 
 def cfc_coefficients(cfc: float, step: float) -> tuple[Floats, Floats]:
-    """Numerator (a0, a1, a2) and denominator (1, -b1, -b2) of one pass of the CFC filter (SAE J211-1, appendix C).
+    """Numerator (a0, a1, a2) and denominator (1, -b1, -b2) of one pass of the CFC filter (SAE J211-1, digital filter).
 
     cfc in Hz, step in s. Two poles; the filter runs forwards and backwards, which makes four and no shift in phase.
     """
@@ -92,8 +92,8 @@ def cfc_filter(time: ArrayLike, values: ArrayLike, cfc: int) -> Floats:
 
     The curve is continued at both ends by its own reflection in the end point, so that a filter that starts has no
     step to ring from. Raises EvaluationError for another class, uneven times, gaps, and times too coarse for the
-    class: J211-1 asks for ten samples for each hertz of the class, and below that the filter would pass what is
-    only an alias.
+    class: J211-1 asks for ten samples a second for each hertz of the class. States are written without a filter
+    against aliases, unlike a sensor's samples, so what vibrates faster than half their rate is in them all the same.
     """
     from scipy.signal import filtfilt
 

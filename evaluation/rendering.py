@@ -197,7 +197,8 @@ def _shown(
     xyz, corners = np.where(there[:, None], xyz, view.centre), corners[shown]
     if corners.shape[1] == 3:
         return pv.PolyData.from_regular_faces(xyz, corners), shown
-    return pv.PolyData.from_irregular_faces(xyz, [face[face >= 0] for face in corners]), shown
+    sized = np.column_stack([(corners >= 0).sum(axis=1), corners])
+    return pv.PolyData(xyz, faces=sized[sized >= 0]), shown
 
 
 def _open(limits: tuple[float, float]) -> tuple[float, float]:

@@ -87,6 +87,13 @@ def test_eroded_faces_and_faces_of_lost_nodes_are_not_drawn():
         assert 0.7 * whole < ink(image).sum() < 0.8 * whole
 
 
+def test_triangles_among_quadrilaterals_are_drawn_as_such():
+    view = choose_view([POINTS], FACES)
+    halves = np.where(np.arange(4) == 3, -1, FACES)
+    whole, half = (ink(render(POINTS, f, view, width=200)).sum() for f in (FACES, halves))
+    assert half == pytest.approx(whole / 2, rel=0.05)
+
+
 def test_a_displaced_mesh_is_displaced_by_as_many_pixels():
     view = choose_view([POINTS, POINTS + view_shift()], FACES)
     columns = [np.flatnonzero(ink(render(POINTS + s, FACES, view, width=400)).any(axis=0)) for s in (0, view_shift())]
