@@ -116,6 +116,7 @@ VARIABLES: Mapping[str, Variable] = MappingProxyType(
                 unit="m",
                 meaning="estimated largest node displacement error that the change to the common time made",
             ),
+            _variable("run_checksum", "sim", kind="U", unit="", meaning="SHA-256 of the run's values as written"),
             _variable("complete", "sim", kind="b", unit="", meaning="every state was found and the end time reached"),
         )
     }

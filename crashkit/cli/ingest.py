@@ -1,0 +1,108 @@
+"""`crashkit ingest`: solver runs in, one dataset out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from crashkit.cli._console import print_json, progress, say
+
+
+def command(
+    sources: Annotated[list[Path], typer.Argument(help="Files or folders with runs.", show_default=False)],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Dataset to write: NAME.zarr or NAME.nc.")],
+    params: Annotated[
+        Path | None, typer.Option(help="Table of design parameters, a row a run: CSV, JSON or XLSX.")
+    ] = None,
+    units: Annotated[str | None, typer.Option(help="Unit system of the source: SI, mm-ms-kg, mm-s-t, ...")] = None,
+    reader: Annotated[str | None, typer.Option(help="Source format, where it shall not be told by content.")] = None,
+    mesh: Annotated[Path | None, typer.Option(help="Mesh file with the faces, where the source has none.")] = None,
+    parts: Annotated[str, typer.Option(help="Only these parts: numbers, titles or patterns, with commas.")] = "",
+    exclude_parts: Annotated[str, typer.Option(help="Without these parts.")] = "",
+    keep_rigid_walls: Annotated[
+        bool, typer.Option("--keep-rigid-walls", help="Keep what the solver drew of walls.")
+    ] = False,
+    fields: Annotated[str, typer.Option(help="Further result fields, such as plastic_strain,velocity.")] = "",
+    time: Annotated[
+        str, typer.Option(help="Common output times: begin:end:count, s. Default: the coarsest run's.")
+    ] = "",
+    on_error: Annotated[str, typer.Option(help="stop, or skip runs that cannot be used.")] = "stop",
+    allow_incomplete: Annotated[
+        bool, typer.Option("--allow-incomplete", help="Take runs that were cut short.")
+    ] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Read runs again that the dataset already holds.")
+    ] = False,
+    workers: Annotated[int, typer.Option(help="Processes on this machine.", min=1)] = 1,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler to use instead.")] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+) -> None:
+    """Read solver runs, check them, and write them as one labelled dataset in SI units.
+
+    Interrupted or killed, the same command goes on where it was. New runs are appended to an existing dataset.
+    """
+    from crashkit.ingest import ingest
+
+    if on_error not in ("stop", "skip"):
+        raise typer.BadParameter(f"{on_error!r}; expected stop or skip", param_hint="--on-error")
+    with progress(quiet=json) as bar:
+        task = bar.add_task("ingest", total=None, note="")
+
+        def tell(done: int, total: int, note: str) -> None:
+            bar.update(task, completed=done, total=total or None, note=note)
+
+        summary = ingest(
+            list(sources),
+            output,
+            params=params,
+            units=units,
+            reader=reader,
+            reader_options={"mesh": mesh} if mesh else None,
+            parts=_list(parts),
+            exclude_parts=_list(exclude_parts),
+            keep_rigid_walls=keep_rigid_walls,
+            fields=_list(fields),
+            time=_times(time),
+            on_error="skip" if on_error == "skip" else "stop",
+            allow_incomplete=allow_incomplete,
+            overwrite=overwrite,
+            workers=workers,
+            scheduler=scheduler,
+            progress=tell,
+        )
+    if json:
+        print_json(summary.__dict__)
+        return
+    for note in summary.notes:
+        say(f"  {note}")
+    for run, reason in summary.skipped.items():
+        say(f"  skipped {run}: {reason}")
+    worst = max(summary.alignment_error, key=lambda r: summary.alignment_error[r], default=None)
+    if worst is not None and summary.alignment_error[worst] > 0:
+        say(
+            f"  brought to common times; largest estimated error {summary.alignment_error[worst] * 100:.3g} cm (run {worst})"
+        )
+    say(
+        f"{summary.output}: {len(summary.runs)} runs, {len(summary.written)} of them new, {len(summary.skipped)} skipped"
+    )
+
+
+def _list(text: str) -> list[str]:
+    return [piece.strip() for piece in text.split(",") if piece.strip()]
+
+
+def _times(text: str) -> list[float] | None:
+    if not text:
+        return None
+    try:
+        begin, end, count = text.split(":")
+        first, last, n = float(begin), float(end), int(count)
+        if n < 2 or last <= first:
+            raise ValueError
+    except ValueError as error:
+        raise typer.BadParameter(
+            f"{text!r}; expected begin:end:count, such as 0:0.03:61", param_hint="--time"
+        ) from error
+    return [first + (last - first) * k / (n - 1) for k in range(n)]
