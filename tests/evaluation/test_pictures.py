@@ -26,7 +26,13 @@ from evaluation.pictures import (
     to_png,
 )
 
-SHEET = Sheet(13.0)  # centimetres: small, for speed
+SHEET = Sheet(13.0)
+
+
+@pytest.fixture(autouse=True)
+def _small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Coarse images: drawing without a graphics card takes time."""
+    monkeypatch.setattr("evaluation.pictures.PIXELS_PER_CM", 25)
 
 
 @pytest.fixture(scope="module")
