@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.paraview import write_paraview
-from evaluation.measures import lift
 from evaluation.predictor import Model, Predictor
 from evaluation.reference import Reference
 from evaluation.result import Evaluation
+from evaluation.scoring import full_field
 
 # Bytes of one predicted field held at once; several of them are.
 _BUDGET = 64 << 20
@@ -126,7 +126,10 @@ def _write_full(reference: Reference, model: Model, run: int, truth: NDArray[np.
     coarsest_first = sorted(model.predictors, key=lambda p: -p.level)
 
     def compute(states: slice) -> dict[str, NDArray[Any]]:
-        lifted = {p.name: _lifted(reference, p, p.predict(parameters, reference.time[states])) for p in coarsest_first}
+        lifted = {
+            p.name: full_field(reference, p, p.predict(parameters, reference.time[states]), states.stop - states.start)
+            for p in coarsest_first
+        }
         out = _errors(truth[states], lifted[coarsest_first[-1].name])
         if len(lifted) > 1:
             out |= {f"contribution_{name}": field for name, field in contributions(lifted).items()}
@@ -174,12 +177,6 @@ def _errors(truth: NDArray[np.float32], predicted: NDArray[np.floating]) -> dict
 
 def _units(data: Mapping[str, Any]) -> dict[str, str]:
     return {name: "m" for name in data if name in _METRES or name.startswith("contribution_")}
-
-
-def _lifted(reference: Reference, predictor: Predictor, field: NDArray[np.floating]) -> NDArray[np.float32]:
-    if predictor.level == 0:
-        return np.asarray(field, np.float32)
-    return lift(field, reference.level(predictor.level).to_full)
 
 
 def lone_edges(faces: NDArray[np.integer], edges: NDArray[np.integer]) -> NDArray[np.int64]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,6 +26,7 @@ class ShownFigure:
     wide: str
     narrow: str
     files: tuple[str, ...] = ()
+    share: float = 1.0  # of the width of the page
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,7 @@ def show_figure(kind: Kind, drawing: Drawing, folder: Path, sheet: Sheet, base: 
 
     `base` is the folder of the page, from which the files are linked. Pictures of meshes are shown as PNG.
     """
-    paths = write(drawing, kind.name, folder, sheet)
+    paths, width = write(drawing, kind.name, folder, sheet)
     form = "png" if kind.raster else "svg"
     narrow = image(drawn(drawing, Sheet(PHONE_WIDTH, sheet.styles)), form, dpi=160)
     return ShownFigure(
@@ -105,6 +107,7 @@ def show_figure(kind: Kind, drawing: Drawing, folder: Path, sheet: Sheet, base: 
         data_uri(paths[0 if kind.raster else 1].read_bytes(), form),
         data_uri(narrow, form),
         tuple(path.relative_to(base).as_posix() for path in paths),
+        min(1.0, width / sheet.width),
     )
 
 
@@ -155,4 +158,19 @@ def plain(value: Any) -> str:
         if abs(value) >= 1000:
             return f"{value:,.0f}".replace(",", " ")
         return f"{value:.4f}".rstrip("0").rstrip(".") if abs(value) < 0.01 and abs(value) >= 1e-4 else f"{value:.3g}"
+    return str(value)
+
+
+def plain_json(value: Any) -> Any:
+    """`value` for JSON, which knows no NaN and no arrays."""
+    if isinstance(value, Mapping):
+        return {str(k): plain_json(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple, set)):
+        return [plain_json(v) for v in value]
+    if hasattr(value, "tolist"):
+        return plain_json(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if value is None or isinstance(value, (str, int, float, bool)):
+        return value
     return str(value)

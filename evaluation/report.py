@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+
+import numpy as np
 
 from evaluation import tables
+from evaluation.curves import rating_table
+from evaluation.errors import EvaluationError
 from evaluation.figures import ORDER, drawings, sheet_of
 from evaluation.figures.kind import Columns, to_csv
 from evaluation.figures.style import CM
-from evaluation.page import Page, ShownFigure, ShownTable, ShownView, render_page, show_figure, show_table
+from evaluation.page import Page, ShownFigure, ShownTable, ShownView, plain_json, render_page, show_figure, show_table
 from evaluation.result import Evaluation
 from evaluation.verdict import RULES, statements
 
@@ -53,16 +55,14 @@ def write_report(
     folder: Path,
     *,
     title: str = "How far can these surrogates be trusted?",
-    views: Sequence[ShownView] = (),
-    extra: Sequence[ShownFigure] = (),
+    view: bool = True,
     names: Sequence[str] = ORDER,
     done: Callable[[str], None] | None = None,
 ) -> Path:
     """Write report.html, report.json, figures/ (PNG, SVG, CSV) and tables/ (CSV) into `folder`; returns the page.
 
-    views  interactive views for the page
-    extra  figures made elsewhere, shown behind the first
     names  the figures, in their order
+    view   whether to make an interactive view of the worst run, where the viewer extra is there
     done   called with the name of each figure when it is written
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -74,7 +74,7 @@ def write_report(
         figure_numbers[kind.name] = drawing.numbers()
         if done:
             done(kind.name)
-    shown[1:1] = extra
+    views, left_out = _views(evaluation) if view else ([], "")
     rows = tables.performance(evaluation)
     performance = tables.columns(rows)
     performance["relative_percent"] = [100 * v for v in performance["relative"]]
@@ -82,6 +82,7 @@ def write_report(
         "performance": tables.columns(rows),
         "runs": tables.of_runs(evaluation),
         "worst": tables.worst_places(evaluation),
+        **_ratings(evaluation),
         "split": tables.split(evaluation),
     }
     (folder / "tables").mkdir(exist_ok=True)
@@ -97,7 +98,7 @@ def write_report(
         figures=shown,
         views=views,
         text=_TEXT,
-        methods=list(evaluation.context.items()),
+        methods=[*evaluation.context.items(), *([("Left out", left_out)] if left_out else [])],
         details=_details(evaluation),
         tables=_tables(performance, all_tables),
     )
@@ -110,10 +111,42 @@ def write_report(
         "test_runs": list(evaluation.test_names),
         "mean_displacement_cm": evaluation.size * CM,
     }
-    (folder / "report.json").write_text(json.dumps(_plain(numbers), indent=1), encoding="utf-8")
+    (folder / "report.json").write_text(json.dumps(plain_json(numbers), indent=1), encoding="utf-8")
     path = folder / "report.html"
     path.write_text(render_page(page), encoding="utf-8")
     return path
+
+
+def _ratings(evaluation: Evaluation) -> dict[str, Columns]:
+    """The table of ratings under its name; empty where nothing was rated."""
+    if evaluation.ratings is None or evaluation.sensors is None:
+        return {}
+    nodes = [int(n) for n in evaluation.reference.node_id[evaluation.sensors.probes]]
+    return {"ratings": rating_table(evaluation.ratings, nodes)}
+
+
+def _views(evaluation: Evaluation) -> tuple[list[ShownView], str]:
+    """The worst run of the best model in three dimensions, or why there is no such view."""
+    from evaluation.interactive import interactive_view
+
+    reference = evaluation.reference
+    best = evaluation.ranked[0]
+    errors = evaluation.scores[best.label].of_runs
+    run = evaluation.split.test[int(np.nanargmax(errors))]
+    try:
+        html = interactive_view(
+            reference.position_of(run), reference.faces, reference.time, reference.displacement(run),
+            evaluation.lifted(best, run), names=("truth", best.label), title=f"{reference.runs[run]}: {best.label}",
+            alive=None if reference.alive is None else reference.alive(run),
+        )  # fmt: skip
+    except EvaluationError as error:
+        return [], f"the interactive view ({error})"
+    caption = (
+        f"Run {reference.runs[run]}, the worst of {best.label}, the most accurate model: truth beside "
+        f"prediction. Turn both "
+        f"with the mouse or a finger, and move the slider through time."
+    )
+    return [ShownView(f"Run {reference.runs[run]} in three dimensions", caption, html)], ""
 
 
 def _subtitle(evaluation: Evaluation) -> str:
@@ -138,6 +171,17 @@ def _tables(performance: Columns, all_tables: Mapping[str, Columns]) -> list[Sho
     return [
         show_table("Performance, every column", performance, "", _ALL_HEADINGS, _LOWEST),
         show_table("Worst run, worst node, worst time", all_tables["worst"], "Nodes carry the solver's own numbers."),
+        *(
+            [
+                show_table(
+                    "Ratings of the curves",
+                    all_tables["ratings"],
+                    "ISO/TS 18571 of resultant curves at the probes, mean and lowest over the test runs.",
+                )
+            ]
+            if "ratings" in all_tables
+            else []
+        ),
         show_table("Every test run", all_tables["runs"], "Mean node error over nodes and time, cm."),
         show_table("What each run was used for", all_tables["split"]),
     ]
@@ -148,22 +192,7 @@ def _details(evaluation: Evaluation) -> list[tuple[str, str]]:
         (
             f"Configuration of {model.name} ({', '.join(p.name for p in model.predictors)}"
             + (f", seed {model.seed})" if model.seed is not None else ")"),
-            json.dumps(_plain(dict(model.configuration)), indent=1, sort_keys=True),
+            json.dumps(plain_json(dict(model.configuration)), indent=1, sort_keys=True),
         )
         for model in evaluation.models
     ]
-
-
-def _plain(value: Any) -> Any:
-    """`value` for JSON, which knows no NaN and no arrays."""
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple, set)):
-        return [_plain(v) for v in value]
-    if hasattr(value, "tolist"):
-        return _plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if value is None or isinstance(value, (str, int, float, bool)):
-        return value
-    return str(value)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +16,14 @@ from evaluation.measures import masked_mean
 from evaluation.pod import Pod, StreamedPod
 from evaluation.predictor import Model, Predictor
 from evaluation.reference import Reference
-from evaluation.scoring import Groups, Key, RunScores, Scores, gather, score_run
+from evaluation.regions import by_grid, by_part
+from evaluation.scoring import Groups, Key, RunScores, Scores, full_field, gather, score_run
+from evaluation.sensors import Sensors, choose_sensors
 from evaluation.streaming import over_runs
 from evaluation.timing import Timing, time_predictions
+
+if TYPE_CHECKING:
+    from evaluation.curves import Ratings
 
 N_MODES = 50  # as many singular values as the paper shows
 
@@ -31,6 +38,7 @@ class Evaluation:
     timings   label -> milliseconds of a prediction; empty where not timed
     context   name -> text for the methods section: data, split, versions, machine
     group_names  grouping -> name of each group
+    sensors   where histories were taken; None without
     """
 
     reference: Reference
@@ -43,6 +51,7 @@ class Evaluation:
     timings: Mapping[str, Timing]
     group_names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     context: Mapping[str, str] = field(default_factory=dict)
+    sensors: Sensors | None = None
 
     @property
     def test_names(self) -> tuple[str, ...]:
@@ -70,10 +79,27 @@ class Evaluation:
         """Mean error of lifting the truth itself from `level`, m; 0 on the full mesh."""
         return 0.0 if level == 0 else float(masked_mean(np.array([r.lifting[level] for r in self.runs])))
 
+    def lifted(self, entry: Entry, run: int, states: slice | Sequence[int] = slice(None)) -> NDArray[np.float32]:
+        """Prediction of the first seed of `entry` for run number `run`, on the full mesh: (state, node, 3), m."""
+        predictor = self.predictor(entry)
+        times = self.reference.time[states]
+        field = predictor.predict(self.reference.parameters[run], times)
+        return full_field(self.reference, predictor, field, len(times))
+
     @property
     def size(self) -> float:
         """Mean displacement over nodes, time and test runs, m: what errors are to be held against."""
         return float(masked_mean(np.array([r.size for r in self.runs])))
+
+    @functools.cached_property
+    def ratings(self) -> Ratings | None:
+        """ISO/TS 18571 ratings at the probes; None where there are no sensors or the runs are too short."""
+        from evaluation.curves import rate_curves
+
+        if self.sensors is None:
+            return None
+        truths = [r.watched.probes for r in self.runs if r.watched is not None]
+        return rate_curves(self.reference.time, truths, {e.label: self.scores[e.label].probes[0] for e in self.entries})
 
     @property
     def ranked(self) -> tuple[Entry, ...]:
@@ -104,8 +130,14 @@ def decompose(
 
 
 def default_groups(reference: Reference) -> tuple[Groups, dict[str, tuple[str, ...]]]:
-    """The node groups errors are split into: the parts of the model."""
-    return {"part": reference.part_nodes()}, {"part": reference.part_names}
+    """The node groups errors are split into, and their names: parts, and boxes that cut the longest side in three and
+    the second longest in two."""
+    parts = by_part(reference.faces, reference.face_part, reference.part_names)
+    counts = [1, 1, 1]
+    longest = np.argsort(-np.ptp(reference.position, axis=0), kind="stable")
+    counts[longest[0]], counts[longest[1]] = 3, 2
+    regions = by_grid(reference.position, counts)
+    return {"part": parts.nodes, "region": regions.nodes}, {"part": parts.names, "region": regions.names}
 
 
 def compare(
@@ -118,23 +150,26 @@ def compare(
     scored: Sequence[RunScores] | None = None,
     timed: bool = True,
     context: Mapping[str, str] | None = None,
+    sensors: Sensors | None = None,
 ) -> Evaluation:
     """Compare `models` on the test runs of `split`; everything in this process unless given.
 
     pods     decomposition of the training runs, where it is there already
     scored   one RunScores a test run, in the order of `split.test`, where they were computed elsewhere
     timed    whether predictions are timed here
+    sensors  where histories are taken; default: sensors.choose_sensors
 
     Raises EvaluationError where the models cannot be compared (see comparison.entries) or do not fit the data.
     """
     rows = entries(models, seeds_as_spread)
     predictors = predictors_of(models)
     groups, names = default_groups(reference)
+    sensors = sensors or choose_sensors(reference)
     if pods is None:
         pods = decompose(reference, split.train)
     if scored is None:
         modes = {level: pod.modes for level, pod in pods.items()}
-        scored = over_runs(lambda run: score_run(reference, predictors, run, modes, groups), split.test)
+        scored = over_runs(lambda run: score_run(reference, predictors, run, modes, groups, sensors), split.test)
     if tuple(s.run for s in scored) != split.test:
         raise EvaluationError("the scored runs are not the test runs in their order; expected one score for each")
     timings = {row.label: time_predictions(reference, predictors[row.keys[0]], split.test[0]) for row in rows if timed}
@@ -149,4 +184,5 @@ def compare(
         timings=timings,
         group_names=names,
         context=dict(context or {}),
+        sensors=sensors,
     )

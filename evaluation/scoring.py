@@ -29,6 +29,7 @@ from evaluation.measures import (
 from evaluation.pod import held, projection_error
 from evaluation.predictor import Predictor
 from evaluation.reference import Reference
+from evaluation.sensors import Parted, Sensors, Watched, part_error, watch
 
 Key = tuple[int, int]  # number of the model, number of its predictor
 Groups = Mapping[str, Sequence[NDArray[np.integer]]]
@@ -48,6 +49,8 @@ class RunScore:
     peak            where and when it is worst
     node_sum, node_count     (node,) sum over the states in which the node is there, and how many these are
     groups          name of a grouping ("part", "region") -> (group,) error
+    parted          errors of rigid motion and of deformation
+    watched         what the sensors would see of the prediction; None without sensors
     """
 
     e2: NDArray[np.float64]
@@ -61,6 +64,8 @@ class RunScore:
     node_sum: NDArray[np.float64]
     node_count: NDArray[np.int64]
     groups: Mapping[str, NDArray[np.float64]]
+    parted: Parted
+    watched: Watched | None = None
 
 
 @dataclass(frozen=True)
@@ -71,6 +76,7 @@ class RunScores:
     group_size    grouping -> (group,) its mean over time
     floor         level -> (mode, state) projection error on the nodes of the level, m
     lifting       level >= 1 -> (state,) error of lifting the truth itself from that level: what the mesh costs
+    watched       what the sensors see of the truth
     """
 
     run: int
@@ -79,6 +85,7 @@ class RunScores:
     group_size: Mapping[str, NDArray[np.float64]]
     floor: Mapping[int, NDArray[np.float64]]
     lifting: Mapping[int, NDArray[np.float64]]
+    watched: Watched | None = None
 
 
 def score_run(
@@ -87,11 +94,13 @@ def score_run(
     run: int,
     modes: Mapping[int, NDArray[np.float32]] | None = None,
     groups: Groups | None = None,
+    sensors: Sensors | None = None,
 ) -> RunScores:
     """Score every predictor on run number `run`. Memory: the run and a few fields of its size.
 
     modes   level -> (3 * node of the level, mode) from training runs, for the projection floor
     groups  grouping -> node numbers of each group, such as {"part": reference.part_nodes()}
+    sensors where histories are taken and intrusion is watched
 
     Raises EvaluationError naming model and run where a prediction does not fit the data or is not finite.
     """
@@ -109,7 +118,7 @@ def score_run(
     scores: dict[Key, RunScore] = {}
     for key, predictor in predictors.items():
         try:
-            scores[key] = _score(reference, predictor, run, truth, groups)
+            scores[key] = _score(reference, predictor, run, truth, groups, sensors)
         except EvaluationError as error:
             raise EvaluationError(f"{predictor.name} on run {reference.runs[run]}: {error}") from error
     floor = {
@@ -121,11 +130,17 @@ def score_run(
         for level in reference.levels
     }
     group_size = {name: group_error(still, nodes) for name, nodes in groups.items()}
-    return RunScores(run, scores, mean_node_error(still), group_size, floor, lifting)
+    watched = None if sensors is None else watch(reference, sensors, run, truth)
+    return RunScores(run, scores, mean_node_error(still), group_size, floor, lifting, watched)
 
 
 def _score(
-    reference: Reference, predictor: Predictor, run: int, truth: NDArray[np.float32], groups: Groups
+    reference: Reference,
+    predictor: Predictor,
+    run: int,
+    truth: NDArray[np.float32],
+    groups: Groups,
+    sensors: Sensors | None,
 ) -> RunScore:
     own = truth if predictor.level == 0 else truth[:, reference.level(predictor.level).kept]
     distance = node_distance(truth, full_field(reference, predictor, predictor.reconstruct(held(own))))
@@ -146,15 +161,20 @@ def _score(
         node_sum=np.where(there, distance, 0).sum(axis=0),
         node_count=there.sum(axis=0),
         groups={name: group_error(distance, nodes) for name, nodes in groups.items()},
+        parted=part_error(reference, run, truth, prediction),
+        watched=None if sensors is None else watch(reference, sensors, run, prediction),
     )
 
 
-def full_field(reference: Reference, predictor: Predictor, field: NDArray[np.floating]) -> NDArray[np.float32]:
+def full_field(
+    reference: Reference, predictor: Predictor, field: NDArray[np.floating], states: int | None = None
+) -> NDArray[np.float32]:
     """`field` (state, node of the predictor's level, 3) on the full mesh: (state, node, 3).
 
-    Raises EvaluationError where the predictor gave another shape than its level has.
+    `states` are expected, by default all of the reference. Raises EvaluationError where the predictor gave another
+    shape than its level has.
     """
-    expected = (len(reference.time), reference.level_nodes(predictor.level), 3)
+    expected = (len(reference.time) if states is None else states, reference.level_nodes(predictor.level), 3)
     if field.shape != expected:
         raise EvaluationError(
             f"gave an array of shape {field.shape}; expected {expected} on level {predictor.level} of this dataset; "
@@ -179,6 +199,9 @@ class Scores:
     relative, peak_value, peak_state, peak_node  (seed, run)
     node_mean                           (node,) over seeds, runs and states
     groups                              grouping -> (seed, run, group)
+    rigid, deformation                  (seed, run, state); true_rigid, true_deformation (run, state) their sizes
+    probes                              (seed, run, state, probe, 3) displacements; empty without sensors
+    intrusion                           (seed, run, state)
     """
 
     e2: NDArray[np.float64]
@@ -193,6 +216,12 @@ class Scores:
     peak_node: NDArray[np.int64]
     node_mean: NDArray[np.float64]
     groups: Mapping[str, NDArray[np.float64]]
+    rigid: NDArray[np.float64]
+    deformation: NDArray[np.float64]
+    true_rigid: NDArray[np.float64]
+    true_deformation: NDArray[np.float64]
+    probes: NDArray[np.float64]
+    intrusion: NDArray[np.float64]
 
     @property
     def of_runs(self) -> NDArray[np.float64]:
@@ -244,4 +273,10 @@ def gather(runs: Iterable[RunScores], keys: Sequence[Key]) -> Scores:
         peak_node=np.array([[s.peak.node for s in row] for row in table]),
         node_mean=np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0),
         groups={name: np.array([[s.groups[name] for s in row] for row in table]) for name in flat[0].groups},
+        rigid=np.array([[s.parted.rigid for s in row] for row in table]),
+        deformation=np.array([[s.parted.deformation for s in row] for row in table]),
+        true_rigid=np.array([s.parted.true_rigid for s in table[0]]),
+        true_deformation=np.array([s.parted.true_deformation for s in table[0]]),
+        probes=np.array([[s.watched.probes for s in row if s.watched] for row in table]),
+        intrusion=np.array([[s.watched.intrusion for s in row if s.watched] for row in table]),
     )  # fmt: skip

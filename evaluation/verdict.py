@@ -184,7 +184,8 @@ def _families(evaluation: Evaluation) -> list[Statement]:
     delta, low, high = difference(evaluation.scores[ours.label].of_runs, evaluation.scores[rival.label].of_runs)
     wins = int((evaluation.scores[ours.label].of_runs < evaluation.scores[rival.label].of_runs).sum())
     count = len(evaluation.runs)
-    numbers = f"{_cm(_error(evaluation, ours))} against {_cm(_error(evaluation, rival))}, better on {wins} of {count} test runs"
+    errors = f"{_cm(_error(evaluation, ours))} against {_cm(_error(evaluation, rival))}"
+    numbers = f"{errors}, better on {wins} of {count} test runs"
     spread = f"95 % interval {low * CM:+.2f} to {high * CM:+.2f}"
     interval = f" (difference {delta * CM:+.2f} cm, {spread})" if count > 1 else ""
     about = "Multi-hierarchical against the best baseline"

@@ -21,13 +21,22 @@ if TYPE_CHECKING:
 ORDER = (
     "error_over_time",
     "floors",
-    "levels",
-    "parts",
+    "worst",
+    "map",
     "parameters",
+    "parts",
+    "regions",
+    "rigid",
+    "intrusion",
+    "probes",
+    "ratings",
+    "levels",
+    "contributions",
     "history",
     "budgets",
     "singular_values",
     "coverage",
+    "meshes",
 )
 
 __all__ = ["ORDER", "Drawing", "Kind", "Sheet", "drawings", "kinds", "styles"]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evaluation.figures.kind import Columns, Kind
-from evaluation.figures.style import CM, INK, Sheet
+from evaluation.figures.style import CM, INK, Sheet, few_log_ticks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -62,8 +62,9 @@ class Budgets:
             predict.barh(y - 0.19, b.lifted, 0.36, color=colour, alpha=0.4)
         predict.set_yticks(at, models)
         predict.set_xscale("log")
-        predict.set_xlabel("milliseconds a state")
-        predict.set_title("prediction: own level, lifted (pale)", fontsize=8)
+        few_log_ticks(predict.xaxis)
+        predict.set_xlabel("ms a state, pale: lifted")
+        predict.set_title("prediction")
         predict.grid(axis="y", visible=False)
         for m, b in self.budgets.items():
             style = sheet.style(m)
@@ -74,8 +75,9 @@ class Budgets:
                 m, (b.lifted, b.error * CM), xytext=(5, 3), textcoords="offset points", fontsize=7, color=INK
             )
         trade.set_xscale("log")
-        trade.margins(x=0.3, y=0.12)
-        trade.set_xlabel("milliseconds a state, full mesh")
+        trade.margins(x=0.35, y=0.14)
+        few_log_ticks(trade.xaxis)
+        trade.set_xlabel("ms a state, full mesh")
         trade.set_ylabel("mean node error (cm)")
         trade.set_title("error for its price")
         return figure

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.figures.kind import Columns, Kind
-from evaluation.figures.style import Sheet, look, span
+from evaluation.figures.style import Sheet, look, readable, span
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,6 +42,7 @@ class Coverage:
         from matplotlib.figure import Figure
 
         n = len(self.names)
+        columns, units = zip(*(readable(v, u) for v, u in zip(self.values.T, self.units, strict=True)), strict=True)
         side = min(sheet.width, 4.2 * n)
         with look():
             figure = Figure(figsize=(side / 2.54, side / 2.54), layout="constrained")
@@ -50,7 +51,7 @@ class Coverage:
             for j in range(n):
                 ax = grid[i, j]
                 if i == j:
-                    parts = [self.values[~self.test, i], self.values[self.test, i]]
+                    parts = [columns[i][~self.test], columns[i][self.test]]
                     ax.hist(parts, bins=8, stacked=True, color=[_TRAIN, _TEST], rwidth=0.92)
                     ax.set_yticks([])
                     ax.grid(visible=False)
@@ -60,16 +61,16 @@ class Coverage:
                 else:
                     for chosen, colour, marker in ((~self.test, _TRAIN, "o"), (self.test, _TEST, "D")):
                         ax.plot(
-                            self.values[chosen, j], self.values[chosen, i], linestyle="none", marker=marker,
+                            columns[j][chosen], columns[i][chosen], linestyle="none", marker=marker,
                             color=colour, markersize=3.2, markeredgewidth=0, alpha=0.8,
                         )  # fmt: skip
                     ax.margins(0.06)
                 if i == n - 1:
-                    ax.set_xlabel(span(self.names[j], self.units[j]))
+                    ax.set_xlabel(span(self.names[j], units[j]))
                 else:
                     ax.tick_params(labelbottom=False)
                 if j == 0 and i > 0:
-                    ax.set_ylabel(span(self.names[i], self.units[i]))
+                    ax.set_ylabel(span(self.names[i], units[i]))
                 elif j > 0:
                     ax.tick_params(labelleft=False)
         if self.test.any():
@@ -85,11 +86,10 @@ class Coverage:
         return figure
 
     def caption(self) -> str:
-        low, high = self.values.min(axis=0), self.values.max(axis=0)
-        ranges = "; ".join(
-            f"{span(name, '')} {a:g} to {b:g} {span('', unit).strip(' ()')}".strip()
-            for name, unit, a, b in zip(self.names, self.units, low, high, strict=True)
-        )
+        ranges = []
+        for name, unit, column in zip(self.names, self.units, self.values.T, strict=True):
+            values, shown = readable(column, unit)
+            ranges.append(f"{span(name, '')} {values.min():.4g} to {values.max():.4g} {shown}".strip())
         outside = 0
         if self.test.any() and (~self.test).any():
             train = self.values[~self.test]
@@ -101,8 +101,7 @@ class Coverage:
             else (" No test run lies outside the ranges of the training runs." if self.test.any() else "")
         )
         return (
-            f"Where the runs lie in the design space: {ranges}. Empty patches are places about which the models "
-            f"were told "
+            f"Where the runs lie in the design space: {'; '.join(ranges)}. About empty patches the data says "
             f"nothing.{note}"
         )
 

@@ -68,7 +68,7 @@ class ErrorOverTime:
             f"Mean node error on the full mesh over time. Thin lines are the {len(self.runs)} test runs one by "
             f"one, the "
             f"thick line is their mean, and grey lines repeat the means of the other models. Look for thin lines far "
-            f"above the thick one: with the best model, {best}, run {self.runs[worst_run]} is the worst. Its mean is "
+            f"above the thick one: with the best model, {best}, the worst is {self.runs[worst_run]}. Its mean is "
             f"largest at {self.time[last] * MS:.1f} ms with {means[best][last] * CM:.2f} cm, when the structure "
             f"has moved by "
             f"{self.size[last] * CM:.1f} cm on average."

@@ -97,7 +97,7 @@ class Floors:
         p = self.points[best]
         need = np.flatnonzero(self.floor <= p.total)
         modes = (
-            f"a projection on {need[0] + 1} modes would be as exact"
+            f"a projection on {need[0] + 1} mode{'s' if need[0] else ''} would be as exact"
             if need.size
             else f"no projection on up to {len(self.floor)} modes would be as exact"
         )

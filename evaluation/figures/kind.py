@@ -47,9 +47,14 @@ class Kind:
 
 
 def drawn(drawing: Drawing, sheet: Sheet) -> Figure:
-    """The figure in the common look."""
+    """The figure in the common look, laid out once for all the files it is written to."""
     with look():
-        return drawing.draw(sheet)
+        figure = drawing.draw(sheet)
+        engine = figure.get_layout_engine()
+        if engine is not None:
+            engine.execute(figure)
+            figure.set_layout_engine("none")
+    return figure
 
 
 def to_csv(columns: Columns) -> str:
@@ -81,12 +86,12 @@ def image(figure: Figure, form: str, dpi: int = 200) -> bytes:
     return out.getvalue()
 
 
-def write(drawing: Drawing, name: str, folder: Path, sheet: Sheet) -> list[Path]:
-    """Write `name`.png, .svg and .csv into `folder`; returns the paths in this order."""
+def write(drawing: Drawing, name: str, folder: Path, sheet: Sheet) -> tuple[list[Path], float]:
+    """Write `name`.png, .svg and .csv into `folder`; returns the paths in this order, and the width drawn, cm."""
     folder.mkdir(parents=True, exist_ok=True)
     figure = drawn(drawing, sheet)
     paths = [folder / f"{name}.{suffix}" for suffix in ("png", "svg", "csv")]
     paths[0].write_bytes(image(figure, "png"))
     paths[1].write_bytes(image(figure, "svg"))
     paths[2].write_text(to_csv(drawing.numbers()), encoding="utf-8")
-    return paths
+    return paths, float(figure.get_figwidth()) * 2.54

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.figures.kind import Columns, Kind
-from evaluation.figures.style import CM, FAINT, Sheet, span
+from evaluation.figures.style import CM, FAINT, Sheet, readable, span
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,16 +40,18 @@ class ErrorOverParameters:
     def draw(self, sheet: Sheet) -> Figure:
         figure, axes = sheet.panels(len(self.names), height=5.8, columns=min(3, len(self.names)), share_y=True)
         for k, ax in enumerate(axes):
-            order = np.argsort(self.values[:, k])
+            values, unit = readable(self.values[:, k], self.units[k])
+            ranges, _ = readable(np.append(self.ranges[k], np.abs(self.values[:, k]).max()), self.units[k])
+            order = np.argsort(values)
             for model, errors in self.errors.items():
                 style = sheet.style(model)
                 ax.plot(
-                    self.values[order, k], errors[order] * CM, linestyle="none", marker=style.marker,
+                    values[order], errors[order] * CM, linestyle="none", marker=style.marker,
                     color=style.colour, markersize=4.5, alpha=0.85, label=model, markeredgewidth=0,
                 )  # fmt: skip
-            for edge in self.ranges[k]:
+            for edge in ranges[:2]:
                 ax.axvline(edge, color=FAINT, linewidth=0.8, linestyle=":")
-            ax.set_xlabel(span(self.names[k], self.units[k]))
+            ax.set_xlabel(span(self.names[k], unit))
             ax.set_ylim(bottom=0)
         axes[0].set_ylabel("mean node error (cm)")
         sheet.legend(figure, axes[0])

@@ -61,7 +61,7 @@ class ErrorOfGroups:
         sheet.legend(figure, ax)
         for y, k in zip(at, order, strict=True):
             ax.text(
-                1.0, y, f"moves {self.size[k] * CM:.1f} cm ", transform=ax.get_yaxis_transform(), ha="right",
+                1.01, y, f"moves {self.size[k] * CM:.1f} cm", transform=ax.get_yaxis_transform(), ha="left",
                 va="center", fontsize=7, color=INK, alpha=0.65,
             )  # fmt: skip
         ax.margins(x=0.25)

@@ -22,9 +22,10 @@ _SHADES = (INK, "#0072B2", "#56B4E9", "#009E73", "#E69F00", "#CC79A7")
 
 @dataclass(frozen=True)
 class SingularValues:
-    """values: number of nodes of a mesh -> (mode,) singular values, largest first, any unit."""
+    """values: number of nodes of a mesh -> (mode,) singular values, largest first, any unit; runs: of which runs."""
 
     values: Mapping[int, NDArray[np.float64]]
+    runs: str = "runs"
     count: int = 50
 
     def numbers(self) -> Columns:
@@ -53,18 +54,24 @@ class SingularValues:
         full = next(iter(self.values.values()))
         row = full / full[0]
         below = np.flatnonzero(row < 0.01)
-        reach = f"the {below[0] + 1}th is the first below 1 %" if below.size else f"none of {len(row)} is below 1 %"
+        reach = f"number {below[0] + 1} is the first below 1 %" if below.size else f"none of {len(row)} is below 1 %"
         fourth = f"The fourth is {row[3]:.3f} of the first; " if len(row) > 3 else ""
+        coarse = (
+            " Where the curve of a coarse mesh lies on that of the full mesh, it carries the same motion."
+            if len(self.values) > 1
+            else ""
+        )
         return (
-            f"Singular values of the training runs' displacements, divided by the first. {fourth}{reach}. The slower "
-            f"they fall, the more modes a linear reduction needs, and the more a nonlinear one may win. Where the "
-            f"curves of the coarse meshes lie on that of the full mesh, the coarse mesh carries the same motion."
+            f"Singular values of the displacements of all {self.runs}, divided by the first. {fourth}{reach}. "
+            f"The slower "
+            f"they fall, the more modes a linear reduction needs, and the more a nonlinear one may win.{coarse}"
         )
 
 
 def select(evaluation: Evaluation) -> SingularValues:
     return SingularValues(
-        {evaluation.reference.level_nodes(level): pod.singular_values for level, pod in evaluation.pods.items()}
+        {evaluation.reference.level_nodes(level): pod.singular_values for level, pod in evaluation.pods.items()},
+        "training runs",
     )
 
 

@@ -141,7 +141,27 @@ def smoothed(values: NDArray[np.float64], window: int | None = None) -> NDArray[
     return np.array([np.median(values[max(0, k - half) : k + half + 1]) for k in range(len(values))])
 
 
+def readable(values: NDArray[np.float64], unit: str) -> tuple[NDArray[np.float64], str]:
+    """`values` and their unit as people read them: MPa instead of millions of Pa, m/s, mm below a centimetre."""
+    largest = float(np.abs(values).max(initial=0.0))
+    if unit == "Pa" and largest >= 1e5:
+        return values * 1e-6, "MPa"
+    if unit == "m" and 0 < largest < 0.02:
+        return values * 1e3, "mm"
+    return values, {"m s-1": "m/s", "degree": "°", "1": ""}.get(unit, unit)
+
+
 def span(label: str, unit: str) -> str:
     """An axis label: what it is, and its unit where it has one."""
-    pretty = {"m s-1": "m/s", "degree": "°", "1": ""}.get(unit, unit)
-    return f"{label.replace('_', ' ')} ({pretty})" if pretty else label.replace("_", " ")
+    return f"{label.replace('_', ' ')} ({unit})" if unit else label.replace("_", " ")
+
+
+def few_log_ticks(axis: Any) -> None:
+    """Plain numbers at 1, 2 and 5 of each decade of a logarithmic axis, at decades alone where there are many."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    low, high = axis.get_view_interval()
+    decades = np.log10(high / low) if low > 0 else 3.0
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if decades < 1.6 else (1.0,), numticks=12))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())

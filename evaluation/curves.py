@@ -1,0 +1,134 @@
+"""Curves at the probes: resultants, filtered as sensors are, and their ratings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaluation.errors import EvaluationError
+from evaluation.measures import masked_mean
+from evaluation.probes import GRADES, cfc_filter, possible_classes, probe_histories, rate
+
+HIGHEST_CLASS = 180  # structural velocities and displacements; crush and occupant channels go higher than states do
+QUANTITIES = ("displacement", "velocity", "acceleration")
+_TO_SHOWN = {"displacement": (100.0, "cm"), "velocity": (1.0, "m/s"), "acceleration": (1 / 9.80665, "g")}
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Resultants (state, probe) of one run: m, m/s and m/s2. `cfc` is None where the states allow no filter class;
+    velocity and acceleration are then as they come out of the differences, and no acceleration is given."""
+
+    displacement: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    acceleration: NDArray[np.float64] | None
+    cfc: int | None
+
+
+def curves(time: NDArray[np.float64], displacement: NDArray[np.floating]) -> Curve:
+    """Resultant curves of probes: time (state,) s, displacement (state, probe, 3) m; at least four states."""
+    cfc = filter_class(time)
+    seen = probe_histories(time, displacement, np.arange(displacement.shape[1]))
+
+    def resultant(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        filtered = values if cfc is None else cfc_filter(time, values, cfc)
+        return np.linalg.norm(filtered, axis=-1)
+
+    return Curve(
+        np.linalg.norm(seen.displacement, axis=-1),
+        resultant(seen.velocity),
+        None if cfc is None else resultant(seen.acceleration),
+        cfc,
+    )
+
+
+def filter_class(time: NDArray[np.float64]) -> int | None:
+    """The highest class up to CFC 180 that the states are dense and even enough for; None where there is none."""
+    try:
+        return max((c for c in possible_classes(time) if c <= HIGHEST_CLASS), default=None)
+    except EvaluationError:  # uneven times
+        return None
+
+
+def shown(quantity: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """`values` in the unit in which engineers read them: cm, m/s, g."""
+    return values * _TO_SHOWN[quantity][0]
+
+
+def unit(quantity: str) -> str:
+    """That unit."""
+    return _TO_SHOWN[quantity][1]
+
+
+@dataclass(frozen=True)
+class Ratings:
+    """ISO/TS 18571 ratings, 0 to 1: model -> (run, probe, quantity), NaN where a curve cannot be rated."""
+
+    quantities: tuple[str, ...]
+    cfc: int | None
+    models: Mapping[str, NDArray[np.float64]]
+
+
+def rate_curves(
+    time: NDArray[np.float64],
+    truths: Sequence[NDArray[np.floating]],
+    predictions: Mapping[str, Sequence[NDArray[np.floating]]],
+) -> Ratings | None:
+    """Rate the resultant curves of every model at every probe of every run.
+
+    time (state,) s; truths and each model's predictions: one (state, probe, 3) displacement, m, a run. None where
+    the runs are too short, or no curve ever changes.
+    """
+    if len(time) < 4:
+        return None
+    true_curves = [curves(time, u) for u in truths]
+    quantities = tuple(q for q in QUANTITIES if true_curves and getattr(true_curves[0], q) is not None)
+    out = {}
+    for model, fields in predictions.items():
+        pairs = [(truth, curves(time, u)) for truth, u in zip(true_curves, fields, strict=True)]
+        out[model] = np.array(
+            [
+                [
+                    [_rating(time, getattr(truth, q)[:, p], getattr(mine, q)[:, p]) for q in quantities]
+                    for p in range(truth.displacement.shape[1])
+                ]
+                for truth, mine in pairs
+            ]
+        )
+    if not out or all(np.isnan(v).all() for v in out.values()):
+        return None
+    return Ratings(quantities, true_curves[0].cfc, out)
+
+
+def _rating(time: NDArray[np.float64], truth: NDArray[np.float64], mine: NDArray[np.float64]) -> float:
+    try:
+        return rate(time, truth, mine).overall
+    except EvaluationError:  # a curve that never changes, or one too short once its node is gone
+        return float("nan")
+
+
+def grade(rating: float) -> str:
+    """The word of the standard for a rating."""
+    return next((name for bound, name in GRADES if rating > bound), "poor") if rating == rating else "not rated"
+
+
+def rating_table(found: Ratings, nodes: Sequence[int]) -> dict[str, list[object]]:
+    """Model, quantity, probe -> mean and lowest rating over the runs, and the grade of the mean.
+
+    nodes  the solver's number of each probe
+    """
+    table: dict[str, list[object]] = {
+        name: [] for name in ("model", "quantity", "probe_node", "mean_rating", "lowest_rating", "grade")
+    }
+    for model, values in found.models.items():
+        for q, quantity in enumerate(found.quantities):
+            for p, node in enumerate(nodes):
+                of_runs = values[:, p, q]
+                mean = float(masked_mean(of_runs))
+                lowest = float(np.nanmin(of_runs)) if np.isfinite(of_runs).any() else float("nan")
+                for name, value in zip(table, (model, quantity, node, mean, lowest, grade(mean)), strict=True):
+                    table[name].append(value)
+    return table

@@ -1,0 +1,112 @@
+"""Histories at the probes: resultant displacement, velocity and acceleration of truth and models."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaluation.curves import QUANTITIES, Curve, curves, shown, unit
+from evaluation.figures.kind import Columns, Kind
+from evaluation.figures.style import INK, MS, Sheet
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from evaluation.result import Evaluation
+
+_SHOWN = 4
+
+
+@dataclass(frozen=True)
+class Probes:
+    """One run: truth and predictions as resultant curves (state, probe); nodes (probe,) the solver's numbers."""
+
+    run: str
+    time: NDArray[np.float64]
+    nodes: tuple[int, ...]
+    truth: Curve
+    predictions: Mapping[str, Curve]
+
+    def _quantities(self) -> list[str]:
+        return [q for q in QUANTITIES if getattr(self.truth, q) is not None]
+
+    def numbers(self) -> Columns:
+        rows = []
+        for q in self._quantities():
+            for name, curve in {"truth": self.truth, **self.predictions}.items():
+                values = shown(q, getattr(curve, q))
+                rows += [
+                    (q, unit(q), name, node, t * MS, values[k, p])
+                    for p, node in enumerate(self.nodes)
+                    for k, t in enumerate(self.time)
+                ]
+        return dict(
+            zip(("quantity", "unit", "curve", "node", "time_ms", "value"), zip(*rows, strict=True), strict=True)
+        )
+
+    def draw(self, sheet: Sheet) -> Figure:
+        quantities = self._quantities()
+        figure, axes = sheet.panels(len(quantities) * len(self.nodes), height=4.0, columns=len(quantities))
+        for k, ax in enumerate(axes):
+            p, q = divmod(k, len(quantities))
+            quantity = quantities[q]
+            ax.plot(
+                self.time * MS, shown(quantity, getattr(self.truth, quantity)[:, p]), color=INK, linewidth=2.2,
+                label="truth",
+            )  # fmt: skip
+            for model, curve in list(self.predictions.items())[:_SHOWN]:
+                style = sheet.style(model)
+                ax.plot(
+                    self.time * MS, shown(quantity, getattr(curve, quantity)[:, p]), color=style.colour,
+                    linestyle=style.line, linewidth=1.2, label=model,
+                )  # fmt: skip
+            ax.set_ylabel(f"{quantity} ({unit(quantity)})")
+            ax.set_title(f"node {self.nodes[p]}", fontsize=8)
+            ax.margins(x=0)
+            if p == len(self.nodes) - 1 or sheet.narrow:
+                ax.set_xlabel("time (ms)")
+        sheet.legend(figure, axes[0])
+        return figure
+
+    def caption(self) -> str:
+        cfc = self.truth.cfc
+        filtered = (
+            f"Velocity and acceleration are differences of the states through the CFC {cfc} filter of SAE J211, the "
+            f"highest class up to 180 that these states are dense enough for."
+            if cfc
+            else "The states are too far apart, or too uneven, for any filter class of SAE J211, so velocities are "
+            "plain differences and accelerations are left out."
+        )
+        few = f" The {_SHOWN} most accurate models are drawn." if len(self.predictions) > _SHOWN else ""
+        return (
+            f"What sensors at {len(self.nodes)} nodes would have measured in run {self.run}, the median run of "
+            f"the most "
+            f"accurate model: resultant displacement, velocity and acceleration. {filtered} A surrogate that is "
+            f"right in its "
+            f"mean displacement may still be of no use for accelerations; here it shows.{few}"
+        )
+
+
+def select(evaluation: Evaluation) -> Probes | None:
+    time = evaluation.reference.time
+    if evaluation.sensors is None or len(time) < 4:
+        return None
+    errors = evaluation.scores[evaluation.ranked[0].label].of_runs
+    run = int(np.argsort(errors, kind="stable")[(len(errors) - 1) // 2])
+    watched = evaluation.runs[run].watched
+    if watched is None:
+        return None
+    return Probes(
+        evaluation.test_names[run],
+        time,
+        tuple(int(n) for n in evaluation.reference.node_id[evaluation.sensors.probes]),
+        curves(time, watched.probes),
+        {e.label: curves(time, evaluation.scores[e.label].probes[0, run]) for e in evaluation.ranked},
+    )
+
+
+FIGURE = Kind("probes", "Histories at probes", select)

@@ -1,0 +1,46 @@
+"""Folders that appear under their name when everything in them is complete, and never half-written."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from crashkit.errors import OutputError
+
+
+@contextlib.contextmanager
+def complete_folder(output: Path, mark: str) -> Iterator[Path]:
+    """A new folder beside `output` that takes its place when the block ends well, and vanishes otherwise.
+
+    mark  name of a file by which an earlier result is known: only such a folder, or an empty one, is replaced
+
+    Raises OutputError where `output` is something else, or nothing can be written there.
+    """
+    if output.exists() and not (output / mark).exists() and (not output.is_dir() or any(output.iterdir())):
+        raise OutputError(
+            f"{output}: exists and holds no {mark}; expected a new folder, or an earlier result to replace"
+        )
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(dir=output.parent, prefix=f".{output.name}-", suffix=".partial"))
+    except OSError as error:
+        raise OutputError(
+            f"{output}: no folder can be made there ({error.strerror or error}); choose another with -o"
+        ) from error
+    try:
+        yield partial
+        partial.chmod(0o755)
+        old = partial.with_suffix(".old")
+        if output.exists():
+            output.replace(old)
+        partial.replace(output)
+        shutil.rmtree(old, ignore_errors=True)
+    except OSError as error:
+        raise OutputError(
+            f"{output}: cannot be written ({error.strerror or error}); check permissions and free space"
+        ) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)

@@ -1,0 +1,158 @@
+"""Where histories are taken and what is watched for intrusion: chosen by the user, or by stated rules."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaluation.errors import EvaluationError
+from evaluation.probes import intrusion
+from evaluation.reference import Reference
+from evaluation.rigid import split_error
+
+AXES = {"x": 0, "y": 1, "z": 2}
+N_PROBES = 4
+# Bytes of float64 positions handled at once in the rigid fit, which makes several copies of them.
+_BUDGET = 96 << 20
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """probes (probe,) and intruding (k,) node numbers; direction (3,) unit vector; watching (w,) or None (ground).
+
+    `about` says how the intrusion was defined.
+    """
+
+    probes: NDArray[np.int64]
+    intruding: NDArray[np.int64]
+    direction: NDArray[np.float64]
+    watching: NDArray[np.int64] | None
+    about: str
+
+
+@dataclass(frozen=True)
+class Watched:
+    """What the sensors saw of one field; NaN where nodes are gone.
+
+    probes     (state, probe, 3) m, displacement
+    intrusion  (state,) m, of the node furthest in
+    """
+
+    probes: NDArray[np.float64]
+    intrusion: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Parted:
+    """Errors (state,), m, of rigid motion and of deformation, and the true sizes of both (see evaluation.rigid)."""
+
+    rigid: NDArray[np.float64]
+    deformation: NDArray[np.float64]
+    true_rigid: NDArray[np.float64]
+    true_deformation: NDArray[np.float64]
+
+
+def choose_sensors(
+    reference: Reference, probes: Sequence[int] | None = None, intrusion: tuple[str, str] | None = None
+) -> Sensors:
+    """Sensors on the structure.
+
+    probes     the solver's node numbers; by default four nodes: the one nearest to the middle, then always the one
+               furthest from those chosen
+    intrusion  name of a part and a direction (x, -x, y, -y, z, -z), seen from the nodes of all other parts; by
+               default any node of the structure, against the direction in which the structure moves in the first run,
+               seen from the structure's own rigid motion
+
+    Raises EvaluationError for node numbers and parts that do not exist.
+    """
+    chosen = _spread(reference.position) if probes is None else _numbers(reference, probes)
+    everything = np.arange(reference.n_nodes)
+    if intrusion is not None:
+        part, along = intrusion
+        inside = _part(reference, part)
+        outside = np.setdiff1d(everything, inside)
+        if len(outside) < 3:
+            raise EvaluationError(
+                f"part {part!r} is all there is, so nothing is left to watch it from; name another part"
+            )
+        about = f"nodes of {part} along {along}, as seen from the rigid motion of all other nodes"
+        return Sensors(chosen, inside, _direction(along), outside, about)
+    moved = reference.displacement(0)
+    mean = np.nanmean(moved[-1].astype(np.float64), axis=0)
+    axis = int(np.argmax(np.abs(mean)))
+    direction = np.zeros(3)
+    direction[axis] = -np.sign(mean[axis]) or -1.0
+    along = f"{'-' if direction[axis] < 0 else '+'}{'xyz'[axis]}"
+    about = f"any node along {along}, against the motion, as seen from the rigid motion of the whole structure"
+    return Sensors(chosen, everything, direction, everything, about)
+
+
+def watch(reference: Reference, sensors: Sensors, run: int, field: NDArray[np.floating]) -> Watched:
+    """What `sensors` see of `field` (state, node, 3), m, in run number `run`; a few states at a time."""
+    position = reference.position_of(run)
+    history = [
+        intrusion(position, field[s], sensors.intruding, sensors.direction, sensors.watching).history
+        if np.isfinite(field[s][:, sensors.intruding]).any()
+        else np.full(len(field[s]), np.nan)
+        for s in _blocks(field)
+    ]
+    return Watched(field[:, sensors.probes].astype(np.float64), np.concatenate(history))
+
+
+def part_error(reference: Reference, run: int, truth: NDArray[np.floating], prediction: NDArray[np.floating]) -> Parted:
+    """Errors of `prediction` by kind (evaluation.rigid.split_error), a few states at a time."""
+    position = reference.position_of(run)
+    pieces = [split_error(position, truth[s], prediction[s]) for s in _blocks(truth)]
+    return Parted(
+        *(
+            np.concatenate([getattr(p, name) for p in pieces])
+            for name in ("rigid", "deformation", "true_rigid", "true_deformation")
+        )
+    )
+
+
+def _blocks(field: NDArray[np.floating]) -> list[slice]:
+    step = max(1, _BUDGET // (field.shape[1] * 24))
+    return [slice(k, k + step) for k in range(0, len(field), step)]
+
+
+def _spread(position: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Greedy farthest points, starting nearest to the middle."""
+    chosen = [int(np.argmin(np.linalg.norm(position - position.mean(axis=0), axis=1)))]
+    nearest = np.linalg.norm(position - position[chosen[0]], axis=1)
+    while len(chosen) < min(N_PROBES, len(position)):
+        chosen.append(int(np.argmax(nearest)))
+        nearest = np.minimum(nearest, np.linalg.norm(position - position[chosen[-1]], axis=1))
+    return np.array(chosen)
+
+
+def _numbers(reference: Reference, probes: Sequence[int]) -> NDArray[np.int64]:
+    where = {int(n): k for k, n in enumerate(reference.node_id)}
+    for probe in probes:
+        if int(probe) not in where:
+            raise EvaluationError(
+                f"probe at node {probe}: the dataset has no such node; expected the solver's node numbers, "
+                f"{reference.node_id.min()} to {reference.node_id.max()}"
+            )
+    return np.array([where[int(n)] for n in probes], dtype=np.int64)
+
+
+def _part(reference: Reference, name: str) -> NDArray[np.int64]:
+    if name not in reference.part_names:
+        raise EvaluationError(f"part {name!r} does not exist; the dataset has {', '.join(reference.part_names)}")
+    nodes = reference.part_nodes()[reference.part_names.index(name)]
+    if not nodes.size:
+        raise EvaluationError(f"part {name!r} has no node; name another part")
+    return nodes
+
+
+def _direction(text: str) -> NDArray[np.float64]:
+    sign, axis = (-1.0, text[1:]) if text.startswith("-") else (1.0, text.removeprefix("+"))
+    if axis not in AXES:
+        raise EvaluationError(f"direction {text!r} not understood; expected x, y or z, with - for the other way")
+    out = np.zeros(3)
+    out[AXES[axis]] = sign
+    return out
