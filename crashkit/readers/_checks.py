@@ -2,23 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.errors import CrashkitError, ReadError
-from crashkit.readers.base import Run
-
-
-class EachRun(Iterator[Run]):
-    """Runs opened one after the other; one that cannot be opened raises, and the next call goes on behind it."""
-
-    def __init__(self, openers: Sequence[Callable[[], Run]]) -> None:
-        self._openers = iter(openers)
-
-    def __next__(self) -> Run:
-        return next(self._openers)()
 
 
 def time_problems(time: NDArray[np.float64], places: Sequence[object]) -> list[str]:
@@ -40,6 +29,17 @@ def require_finite(values: NDArray[np.floating], what: str, place: str) -> None:
             f"{place}: {what} of entry {index} is not a finite number ({int((~good).sum())} such values); "
             "the run diverged or the file is damaged"
         )
+
+
+def holds_positions(first: NDArray[np.floating], position: NDArray[np.floating]) -> bool:
+    """Whether an array (node, 3) called displacement holds current positions instead.
+
+    Told by the first state: displacements are zero there, positions are `position` (node, 3).
+    """
+    size = float(np.ptp(position, axis=0).max(initial=0.0))
+    close = 1e-5 * max(size, float(np.abs(position).max(initial=0.0)))
+    is_zero = np.abs(first).max(initial=0.0) <= close
+    return bool(np.abs(first - position).max(initial=0.0) <= close and not is_zero)
 
 
 def require_indices(nodes: NDArray[np.integer], count: int, what: str, place: object, lowest: int = 0) -> None:

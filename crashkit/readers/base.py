@@ -8,7 +8,7 @@ layout belong to `crashkit.ingest`, so that they are the same for every format.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol
@@ -120,6 +120,28 @@ class Run(ABC):
         """Let go of files."""
 
 
+class Runs(Iterator[Run]):
+    """Runs of one source, by name; each is opened only when its turn comes or when it is asked for.
+
+    One that cannot be opened raises ReadError, and the iteration goes on behind it.
+    """
+
+    def __init__(self, openers: Mapping[str, Callable[[], Run]]) -> None:
+        self._openers = dict(openers)
+        self._left = iter(self._openers)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(self._openers)
+
+    def open(self, name: str) -> Run:
+        """The run called `name`, without opening any other. Raises KeyError, or ReadError as in the iteration."""
+        return self._openers[name]()
+
+    def __next__(self) -> Run:
+        return self.open(next(self._left))
+
+
 class Reader(Protocol):
     """One source format."""
 
@@ -133,10 +155,9 @@ class Reader(Protocol):
         """
 
     def runs(self, path: Path, **options: object) -> Iterator[Run]:
-        """The runs in `path`, opened one after the other when the iterator gets there.
+        """The runs in `path`, opened one after the other; the readers of this folder give `Runs`.
 
-        Raises crashkit.errors.ReadError, naming the file and the place in it. The iterators of this folder go on
-        behind a run that raised, so that one damaged run does not hide the others.
+        Raises crashkit.errors.ReadError, naming the file and the place in it.
         """
 
 

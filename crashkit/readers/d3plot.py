@@ -16,7 +16,7 @@ A d3plot does not know its end time; it is taken from *CONTROL_TERMINATION of a 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,10 +27,11 @@ from numpy.typing import NDArray
 from crashkit.errors import ReadError
 from crashkit.readers import register
 from crashkit.readers._cells import LINE, VERTEX, shell_faces, solid_cells, stack_cells
-from crashkit.readers._checks import EachRun, require_finite, require_indices, require_options, time_problems
+from crashkit.readers._checks import require_finite, require_indices, require_options, time_problems
 from crashkit.readers._d3plot_file import D3plotFile, word_size
+from crashkit.readers._folders import runs_in
 from crashkit.readers._names import WALL_NAME, quantity
-from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh
+from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh, Runs
 
 _RIGID = 20
 _DECK_SUFFIXES = (".k", ".key", ".dyn")
@@ -66,12 +67,12 @@ class D3plot:
         except OSError:
             return False
 
-    def runs(self, path: Path, **options: object) -> Iterator[Run]:
+    def runs(self, path: Path, **options: object) -> Runs:
         require_options(self.name, options)
         found = _first_files(path) or ({path.name: path} if path.is_file() else {})
         if not found:
             raise ReadError(f"{path}: no d3plot here; expected files d3plot, d3plot01, ...")
-        return EachRun([partial(_D3plotRun, name, file) for name, file in found.items()])
+        return Runs({name: partial(_D3plotRun, name, file) for name, file in found.items()})
 
 
 def _first_files(path: Path) -> dict[str, Path]:
@@ -83,13 +84,7 @@ def _first_files(path: Path) -> dict[str, Path]:
         return {path.resolve().parent.name if alone else path.name: path}
     if not path.is_dir():
         return {}
-    families = {}
-    for folder in (path, *sorted(p for p in path.iterdir() if p.is_dir())):
-        found = _first_files_in(folder)
-        for file in found:
-            inside = file.name if folder is path else f"{folder.name}/{file.name}"
-            families[folder.resolve().name if len(found) == 1 else inside] = file
-    return families
+    return runs_in(path, lambda folder: {file.name: file for file in _first_files_in(folder)})
 
 
 def _first_files_in(folder: Path) -> list[Path]:

@@ -16,7 +16,7 @@ without names, they are taken to be that campaign's: impact_speed in m/s, impact
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
 from crashkit.readers import register
-from crashkit.readers._checks import EachRun, require_finite, require_indices, require_options, time_problems
+from crashkit.readers._checks import require_finite, require_indices, require_options, time_problems
 from crashkit.readers._names import quantity
-from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh
+from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh, Runs
 
 if TYPE_CHECKING:
     import h5py
@@ -61,11 +61,11 @@ class KartHdf5:
         except (OSError, RuntimeError, KeyError, ValueError):
             return False
 
-    def runs(self, path: Path, **options: object) -> Iterator[Run]:
+    def runs(self, path: Path, **options: object) -> Runs:
         require_options(self.name, options, ("mesh",))
         mesh = options.get("mesh")
         campaign = _Campaign(path, None if mesh is None else Path(str(mesh)))
-        return EachRun([partial(_KartRun, campaign, k) for k in range(campaign.runs)])
+        return Runs({campaign.name(k): partial(_KartRun, campaign, k) for k in range(campaign.runs)})
 
 
 def _open(path: Path) -> h5py.File:
@@ -116,6 +116,9 @@ class _Campaign:
         self.fields = self._fields()
         unit = _text(self.displacements.attrs.get("units", ""))
         self.units = "SI" if unit in _METRE else None
+
+    def name(self, index: int) -> str:
+        return f"run_{index:0{max(3, len(str(self.runs - 1)))}d}"
 
     def _dataset(self, name: str, *dimensions: int) -> h5py.Dataset:
         import h5py
@@ -211,8 +214,7 @@ class _KartRun(Run):
 
     def __init__(self, campaign: _Campaign, index: int) -> None:
         self._campaign, self._index = campaign, index
-        digits = max(3, len(str(campaign.runs - 1)))
-        self.name = f"run_{index:0{digits}d}"
+        self.name = campaign.name(index)
         self.solver = _text(campaign.file.attrs.get("source", "")) or "unknown"
         self.files = (campaign.path,) if campaign.mesh_file is None else (campaign.path, campaign.mesh_file)
         self.time = np.array(campaign.time[index])

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import re
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
@@ -26,10 +26,11 @@ from crashkit.errors import ReadError
 from crashkit.readers import _radioss_deck as deck
 from crashkit.readers import register
 from crashkit.readers._cells import LINE, VERTEX, shell_faces, solid_cells, stack_cells
-from crashkit.readers._checks import EachRun, require_finite, require_indices, require_options, time_problems
+from crashkit.readers._checks import require_finite, require_indices, require_options, time_problems
+from crashkit.readers._folders import runs_in
 from crashkit.readers._names import DISPLACEMENT_NAMES, WALL_NAME, field_name, quantity
 from crashkit.readers._radioss_file import Array, Content, beginning, read_layout, starts_well
-from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh
+from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh, Runs
 
 _FILE = re.compile(r"(?P<root>.+)A(?P<number>\d{3,4})(?:\.gz)?")
 # Unpacked gzip files are kept up to this many bytes, so that a state's fields need not unpack it again.
@@ -48,12 +49,12 @@ class OpenRadioss:
         except OSError:
             return False
 
-    def runs(self, path: Path, **options: object) -> Iterator[Run]:
+    def runs(self, path: Path, **options: object) -> Runs:
         require_options(self.name, options)
         families = _families(path)
         if not families:
             raise ReadError(f"{path}: no OpenRadioss animation files (NAMEA001, NAMEA002, ...) here")
-        return EachRun([partial(_RadiossRun, name, files) for name, files in families.items()])
+        return Runs({name: partial(_RadiossRun, name, files) for name, files in families.items()})
 
 
 def _families(path: Path) -> dict[str, dict[int, Path]]:
@@ -67,14 +68,7 @@ def _families(path: Path) -> dict[str, dict[int, Path]]:
         return {root if len(found) > 1 else path.resolve().parent.name: found[root]}
     if not path.is_dir():
         return {}
-    families = {}
-    for folder in (path, *sorted(p for p in path.iterdir() if p.is_dir())):
-        found = _families_in(folder)
-        for root, files in found.items():
-            alone = len(found) == 1
-            inside = root if folder is path else f"{folder.name}/{root}"
-            families[folder.resolve().name if alone else inside] = files
-    return families
+    return runs_in(path, _families_in)
 
 
 def _families_in(folder: Path) -> dict[str, dict[int, Path]]:
