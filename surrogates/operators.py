@@ -1,8 +1,10 @@
 """Graph convolutions on states laid out as [node, batch, channel], and the encoder and decoder stacks made of them.
 
-The layout is the point: a state (n, b, c) is, without a copy, the matrix (n, b*c) that a sparse n x n operator
-multiplies in one product, and the matrix (n*b, c) whose channels one dense product mixes. The graph is the same for
-every sample, so its operator is normalised once, when it is made, and never again.
+Inside, a state is held as [channel, node, batch]. Then, without a copy, each channel is a matrix (n, b) for the sparse
+operator, all channels are one matrix (c, n*b) whose channels one wide product mixes, the powers of the operator stand
+below each other as further channels, and the dense layer at the latent reads the state as (c*n, b). A state whose
+memory already has that order (`buffer.permute(1, 2, 0)`) passes through without being copied. The graph is the same
+for every sample, so its operator is normalised once, when it is made, and never again.
 
 How a level is assembled::
 
@@ -26,6 +28,7 @@ import math
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -44,6 +47,8 @@ Form = Literal["auto", "sparse", "dense"]
 
 # Up to this many nodes one small dense product beats the sparse one; measured with `benchmarks/train_step.py --forms`.
 DENSE_UP_TO = {"cpu": 32, "cuda": 512, "mps": 4096}
+# Up to this many nodes all channels move in one sparse product.
+WIDE_UP_TO = 2048
 
 
 class GraphOperator:
@@ -75,7 +80,7 @@ class GraphOperator:
             matrix = _scaled_by_degree(adjacency + sparse.identity(self.n_nodes))
         self.matrix: sparse.csr_matrix = sparse.csr_matrix(matrix)
         self.matrix.sort_indices()
-        self._tensors: dict[tuple[torch.device, torch.dtype], Tensor] = {}
+        self._tensors: dict[tuple[torch.device, torch.dtype, int], Tensor] = {}
 
     def dense_form(self) -> GraphOperator:
         """The same operator held as a dense matrix (n, n), as torch.export and ONNX need it."""
@@ -89,13 +94,6 @@ class GraphOperator:
         other._tensors = {}
         return other
 
-    def tensor(self, device: torch.device, dtype: torch.dtype) -> Tensor:
-        """The matrix (n, n) on `device`: CSR or dense as the form says. Made once for each device and dtype."""
-        key = (device, dtype)
-        if key not in self._tensors:
-            self._tensors[key] = self._make(device, dtype)
-        return self._tensors[key]
-
     def is_dense(self, device: torch.device) -> bool:
         """Whether the dense form is used on `device`."""
         if self.form == "auto":
@@ -103,21 +101,45 @@ class GraphOperator:
         return self.form == "dense"
 
     def propagate(self, x: Tensor) -> Tensor:
-        """The operator times x: (n, ...) -> (n, ...). Differentiable any number of times, in both modes."""
-        return _Propagate.apply(x, self) if not self.is_dense(x.device) else self._times(x)
+        """The operator times every channel: (channel, n, batch) -> same. Differentiable any number of times."""
+        return self.times(x) if self.is_dense(x.device) else _Propagate.apply(x, self)
 
-    def _times(self, x: Tensor) -> Tensor:
-        flat = x.reshape(self.n_nodes, -1)
-        return torch.mm(self.tensor(x.device, x.dtype), flat).reshape(x.shape)
+    def times(self, x: Tensor, out: Tensor | None = None, *, add: bool = False) -> Tensor:
+        """`propagate` without a gradient of its own; into `out`, and added to what stands there if `add`."""
+        channels, n, batch = x.shape
+        x = x.contiguous()
+        if self.is_dense(x.device):
+            moved = torch.matmul(self.tensor(x.device, x.dtype), x)
+            if out is None:
+                return moved
+            return out.add_(moved) if add else out.copy_(moved)
+        out = torch.empty_like(x) if out is None else out
+        # Large graphs go channel by channel, which keeps a channel in cache; small ones in one call, which costs less.
+        together = channels if n <= WIDE_UP_TO else 1
+        matrix = self.tensor(x.device, x.dtype, together)
+        for source, target in zip(x.view(-1, together * n, batch), out.view(-1, together * n, batch)):
+            torch.addmm(target, matrix, source, beta=int(add), out=target)
+        return out
 
-    def _make(self, device: torch.device, dtype: torch.dtype) -> Tensor:
+    def tensor(self, device: torch.device, dtype: torch.dtype, repeats: int = 1) -> Tensor:
+        """The matrix (n, n) on `device`, CSR or dense as the form says; `repeats` times along the diagonal of a CSR.
+
+        Made once for each device, type and number of repeats.
+        """
+        key = (device, dtype, repeats)
+        if key not in self._tensors:
+            self._tensors[key] = self._make(device, dtype, repeats)
+        return self._tensors[key]
+
+    def _make(self, device: torch.device, dtype: torch.dtype, repeats: int) -> Tensor:
         if self.is_dense(device):
             return torch.from_numpy(self.matrix.toarray()).to(device, dtype)
-        rows, columns = (torch.from_numpy(part.astype(np.int32)) for part in (self.matrix.indptr, self.matrix.indices))
+        matrix = sparse.csr_matrix(sparse.block_diag([self.matrix] * repeats))
+        rows, columns = (torch.from_numpy(part.astype(np.int32)) for part in (matrix.indptr, matrix.indices))
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta state")
             csr = torch.sparse_csr_tensor(
-                rows, columns, torch.from_numpy(self.matrix.data), size=self.matrix.shape, check_invariants=True
+                rows, columns, torch.from_numpy(matrix.data), size=matrix.shape, check_invariants=True
             )
             return csr.to(device=device, dtype=dtype)
 
@@ -164,11 +186,9 @@ def _scaled_by_degree(adjacency: sparse.spmatrix) -> sparse.csr_matrix:
 class _Propagate(torch.autograd.Function):
     """Sparse product with a symmetric matrix: its own transpose, so its derivative is itself."""
 
-    generate_vmap_rule = False
-
     @staticmethod
     def forward(x: Tensor, operator: GraphOperator) -> Tensor:
-        return operator._times(x)
+        return operator.times(x)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -182,98 +202,111 @@ class _Propagate(torch.autograd.Function):
     def jvp(ctx: Any, *tangents: Any) -> Tensor:
         return _Propagate.apply(tangents[0], ctx.operator)
 
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], x: Tensor, operator: GraphOperator) -> tuple[Tensor, int]:
-        # The operator acts on the first axis, so further axes ride along at the end.
-        return _Propagate.apply(x.movedim(in_dims[0] or 0, -1), operator), x.ndim - 1
+
+@cache
+def _powers_of_chebyshev(order: int) -> tuple[tuple[float, ...], ...]:
+    """Row k: the coefficients of T_k in plain powers, from T_k = 2 x T_{k-1} - T_{k-2}."""
+    rows = np.zeros((order, order))
+    for k in range(order):
+        rows[k, : k + 1] = np.polynomial.chebyshev.cheb2poly(np.eye(k + 1)[k])
+    return tuple(map(tuple, rows))
 
 
-def _terms(matrix: Tensor, x: Tensor, order: int) -> list[Tensor]:
-    """T_0 x ... T_{order-1} x for x (n, m), by T_k = 2 L T_{k-1} - T_{k-2}."""
-    terms = [x]
-    if order > 1:
-        terms.append(torch.mm(matrix, x))
-    for _ in range(order - 2):
-        terms.append(torch.addmm(terms[-2], matrix, terms[-1], beta=-1, alpha=2))
-    return terms
+def _of_powers(weight: Tensor) -> Tensor:
+    """The weights V_j (order, in, out) with sum_k T_k(L) x W_k = sum_j L^j x V_j. Its own adjoint is `_of_terms`."""
+    return torch.tensordot(weight.new_tensor(_powers_of_chebyshev(len(weight))).t(), weight, dims=1)
 
 
-def _clenshaw(matrix: Tensor, coefficients: list[Tensor]) -> Tensor:
-    """sum_k T_k c_k for c_k (n, m): as many products as `_terms`, on the coefficients' width."""
-    if len(coefficients) == 1:
-        return coefficients[0]
-    *lower, last = coefficients
-    previous: Tensor | None = None
-    for coefficient in reversed(lower[1:]):
-        following = torch.addmm(coefficient, matrix, last, alpha=2)
-        if previous is not None:
-            following = following - previous
-        previous, last = last, following
-    total = torch.addmm(lower[0], matrix, last)
-    return total if previous is None else total - previous
+def _of_terms(gradient: Tensor) -> Tensor:
+    """The gradient by W_k (order, in, out) from that by V_j."""
+    return torch.tensordot(gradient.new_tensor(_powers_of_chebyshev(len(gradient))), gradient, dims=1)
 
 
-def _cheb_forward(
-    matrix: Tensor, x: Tensor, weight: Tensor, bias: Tensor | None, elu: bool, *, inplace: bool
-) -> tuple[Tensor, list[Tensor]]:
-    """(sum_k T_k x W_k + b, then ELU) and the terms of x where they were made (the side with fewer channels moves)."""
-    order, channels, width = weight.shape
-    n, batch, _ = x.shape
-    terms: list[Tensor] = []
-    if channels <= width:
-        terms = _terms(matrix, x.reshape(n, -1), order)
-        rows = [term.view(-1, channels) for term in terms]
-        out = torch.mm(rows[0], weight[0]) if bias is None else torch.addmm(bias, rows[0], weight[0])
-        for row, mix in zip(rows[1:], weight[1:]):
-            out = torch.addmm(out, row, mix)
-    else:
-        rows_x = x.reshape(-1, channels)
-        mixed = [torch.mm(rows_x, weight[0]) if bias is None else torch.addmm(bias, rows_x, weight[0])]
-        mixed += [torch.mm(rows_x, mix) for mix in weight[1:]]
-        out = _clenshaw(matrix, [part.view(n, -1) for part in mixed])
-    out = out.view(n, batch, width)
-    return (functional.elu(out, inplace=inplace) if elu else out), terms
+def _powers(operator: GraphOperator, x: Tensor, order: int) -> Tensor:
+    """x, L x, .. L^(order-1) x below each other: (c, n, b) -> (order*c, n, b)."""
+    channels, n, batch = x.shape
+    out = x.new_empty(order, channels, n, batch)
+    out[0] = x
+    for k in range(1, order):
+        operator.times(out[k - 1], out[k])
+    return out.view(order * channels, n, batch)
+
+
+def _horner(operator: GraphOperator, coefficients: Tensor) -> Tensor:
+    """sum_k L^k c_k for c (order, c, n, b), in place: -> (c, n, b), the memory of c_0."""
+    for k in range(len(coefficients) - 1, 0, -1):
+        operator.times(coefficients[k], coefficients[k - 1], add=True)
+    return coefficients[0]
 
 
 class _Cheb(torch.autograd.Function):
-    """One Chebyshev convolution with its ELU, and its gradient by hand: products on the narrow side both ways."""
+    """One Chebyshev convolution with its ELU on (channel, n, batch), and its gradient by hand.
+
+    The side with fewer channels moves along the graph: x before its channels are mixed, or the mixed channels
+    afterwards; and in the gradient the same side. The operator is symmetric, so the gradient moves with it as it is.
+    """
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor | None, operator: GraphOperator, elu: bool) -> Tensor:
-        x = x.contiguous()
-        matrix = operator.tensor(x.device, x.dtype)
-        out, terms = _cheb_forward(matrix, x, weight, bias, elu, inplace=True)
+        order, channels, width = weight.shape
+        _, n, batch = x.shape
+        of_powers = _of_powers(weight)
+        if channels <= width:
+            kept = _powers(operator, x, order)
+            mix = of_powers.reshape(order * channels, width).t()
+            flat = kept.view(order * channels, -1)
+            out = mix @ flat if bias is None else torch.addmm(bias[:, None], mix, flat)
+            out = out.view(width, n, batch)
+        else:
+            kept = x.contiguous()
+            mix = of_powers.transpose(1, 2).reshape(order * width, channels)
+            parts = (mix @ kept.view(channels, -1)).view(order, width, n, batch)
+            if bias is not None:
+                parts[0] += bias[:, None, None]
+            out = _horner(operator, parts)
+        if elu:
+            functional.elu(out, inplace=True)
         ctx.operator, ctx.elu, ctx.has_bias = operator, elu, bias is not None
-        ctx.save_for_backward(x, weight, out if elu else None, *terms[1:])
+        ctx.save_for_backward(kept, weight, mix, out if elu else None)
         return out
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        x, weight, out, *moved = ctx.saved_tensors
-        gradient = gradients[0].contiguous()
+        kept, weight, mix, out = ctx.saved_tensors
         order, channels, width = weight.shape
-        n = x.shape[0]
-        matrix = ctx.operator.tensor(x.device, x.dtype)
+        _, n, batch = kept.shape
+        gradient = gradients[0].contiguous()
         if ctx.elu:
             gradient = torch.ops.aten.elu_backward(gradient, 1.0, 1.0, 1.0, True, out)
-        rows = gradient.view(-1, width)
-        gradient_bias = rows.sum(dim=0) if ctx.has_bias else None
+        gradient_bias = gradient.sum(dim=(1, 2)) if ctx.has_bias else None
         gradient_x: Tensor | None = None
         if channels <= width:
-            terms = [x, *moved]
-            gradient_weight = torch.stack([term.view(-1, channels).t() @ rows for term in terms])
+            flat = gradient.view(width, -1)
+            of_powers = (kept.view(order * channels, -1) @ flat.t()).view(order, channels, width)
             if ctx.needs_input_grad[0]:
-                gradient_x = _clenshaw(matrix, [(rows @ mix.t()).view(n, -1) for mix in weight])
+                gradient_x = _horner(ctx.operator, (mix.t() @ flat).view(order, channels, n, batch))
         else:
-            terms = [term.view(-1, width) for term in _terms(matrix, gradient.view(n, -1), order)]
-            rows_x = x.view(-1, channels)
-            gradient_weight = torch.stack([rows_x.t() @ term for term in terms])
+            flat = _powers(ctx.operator, gradient, order).view(order * width, -1)
+            of_powers = (flat @ kept.view(channels, -1).t()).view(order, width, channels).transpose(1, 2)
             if ctx.needs_input_grad[0]:
-                gradient_x = terms[0] @ weight[0].t()
-                for term, mix in zip(terms[1:], weight[1:]):
-                    gradient_x.addmm_(term, mix.t())
-        return None if gradient_x is None else gradient_x.view(x.shape), gradient_weight, gradient_bias, None, None
+                gradient_x = (mix.t() @ flat).view(channels, n, batch)
+        return gradient_x, _of_terms(of_powers), gradient_bias, None, None
+
+
+def _plain_cheb(x: Tensor, weight: Tensor, bias: Tensor | None, operator: GraphOperator) -> Tensor:
+    """The convolution of `_Cheb`, without ELU, by the textbook recurrence in plain operations."""
+    terms = [x]
+    for k in range(1, len(weight)):
+        moved = operator.propagate(terms[-1])
+        terms.append(moved if k == 1 else 2.0 * moved - terms[-2])
+    out = torch.stack([_mix(term, mix) for term, mix in zip(terms, weight)]).sum(dim=0)
+    return out if bias is None else out + bias[:, None, None]
+
+
+def _mix(x: Tensor, weight: Tensor) -> Tensor:
+    """The channels of x (in, n, b) mixed by weight (in, out): -> (out, n, b)."""
+    return torch.tensordot(weight.t(), x, dims=1)
 
 
 class ChebConv(nn.Module):
@@ -309,10 +342,13 @@ class ChebConv(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         _check_state(x, self.operator, self.weight.shape[1])
-        if self.operator.form == "dense":  # plain operations: exportable, differentiable twice
-            matrix = self.operator.tensor(x.device, x.dtype)
-            return _cheb_forward(matrix, x, self.weight, self.bias, self.elu, inplace=False)[0]
-        return _Cheb.apply(x, self.weight, self.bias, self.operator, self.elu)
+        inside = x.permute(2, 0, 1)
+        if self.operator.form == "dense":
+            out = _plain_cheb(inside, self.weight, self.bias, self.operator)
+            out = functional.elu(out) if self.elu else out
+        else:
+            out = _Cheb.apply(inside, self.weight, self.bias, self.operator, self.elu)
+        return out.permute(1, 2, 0)
 
     def extra_repr(self) -> str:
         order, channels, width = self.weight.shape
@@ -339,12 +375,14 @@ class GCNConv(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         channels, width = self.weight.shape
         _check_state(x, self.operator, channels)
-        out = (
-            self.operator.propagate(x) @ self.weight if channels <= width else self.operator.propagate(x @ self.weight)
-        )
+        x = x.permute(2, 0, 1)
+        if channels <= width:
+            out = _mix(self.operator.propagate(x), self.weight)
+        else:
+            out = self.operator.propagate(_mix(x, self.weight))
         if self.bias is not None:
-            out = out + self.bias
-        return functional.elu(out) if self.elu else out
+            out = out + self.bias[:, None, None]
+        return (functional.elu(out) if self.elu else out).permute(1, 2, 0)
 
 
 class GCN2Conv(nn.Module):
@@ -375,9 +413,9 @@ class GCN2Conv(nn.Module):
 
     def forward(self, x: Tensor, x0: Tensor) -> Tensor:
         _check_state(x, self.operator, self.weight.shape[0])
-        h = (1.0 - self.alpha) * self.operator.propagate(x) + self.alpha * x0
-        out = (1.0 - self.beta) * h + self.beta * (h @ self.weight)
-        return functional.elu(out) if self.elu else out
+        h = (1.0 - self.alpha) * self.operator.propagate(x.permute(2, 0, 1)) + self.alpha * x0.permute(2, 0, 1)
+        out = (1.0 - self.beta) * h + self.beta * _mix(h, self.weight)
+        return (functional.elu(out) if self.elu else out).permute(1, 2, 0)
 
 
 class Convolutions(nn.Module):
@@ -420,8 +458,8 @@ class Convolutions(nn.Module):
 class GraphEncoder(nn.Module):
     """Convolutions, then one dense linear layer: x (node, batch, channels[0]) -> z (batch, latent).
 
-    Source: Kneifl et al. 2024, section 3.3 and table 1. Parameters of the dense layer: weight (node, channel, latent)
-    and bias (latent).
+    The dense layer's inputs are ordered channel by channel, node by node within a channel.
+    Source: Kneifl et al. 2024, section 3.3 and table 1.
     """
 
     def __init__(
@@ -432,8 +470,8 @@ class GraphEncoder(nn.Module):
         self.dense = nn.Linear(operator.n_nodes * channels[-1], latent)
 
     def forward(self, x: Tensor) -> Tensor:
-        h = self.convolutions(x)
-        return self.dense(h.transpose(0, 1).reshape(h.shape[1], -1))
+        h = self.convolutions(x).permute(2, 0, 1)
+        return self.dense(h.reshape(-1, h.shape[2]).t())
 
 
 class GraphDecoder(nn.Module):
@@ -451,8 +489,9 @@ class GraphDecoder(nn.Module):
         self.convolutions = Convolutions(operator, channels, order, linear_end=True)
 
     def forward(self, z: Tensor) -> Tensor:
-        h = functional.elu(self.dense(z)).view(z.shape[0], self.n_nodes, -1)
-        return self.convolutions(h.transpose(0, 1).contiguous())
+        h = torch.addmm(self.dense.bias[:, None], self.dense.weight, z.t())
+        h = functional.elu(h, inplace=True).view(-1, self.n_nodes, z.shape[0])
+        return self.convolutions(h.permute(1, 2, 0))
 
 
 @contextmanager

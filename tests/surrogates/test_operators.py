@@ -13,6 +13,7 @@ from torch_geometric.nn import GCNConv as PeerGCN
 
 from surrogates.errors import SurrogateError
 from surrogates.operators import (
+    WIDE_UP_TO,
     ChebConv,
     GCN2Conv,
     GCNConv,
@@ -25,6 +26,11 @@ from surrogates.operators import (
 )
 
 DOUBLE = torch.float64
+
+
+@pytest.fixture(autouse=True)
+def _seeded() -> None:
+    torch.manual_seed(0)
 
 
 def random_edges(n_nodes: int, n_edges: int, seed: int) -> np.ndarray:
@@ -122,17 +128,21 @@ def test_chebyshev_gradient_agrees_with_finite_differences(widths, elu, order):
 
 def test_propagation_is_differentiable_twice_and_forward():
     operator = GraphOperator(random_edges(7, 12, 4), 7, form="sparse")
-    x = torch.randn(7, 2, 3, dtype=DOUBLE, requires_grad=True)
+    x = torch.randn(3, 7, 2, dtype=DOUBLE, requires_grad=True)
     assert torch.autograd.gradcheck(operator.propagate, (x,), check_forward_ad=True)
     assert torch.autograd.gradgradcheck(operator.propagate, (x,))
 
 
+@pytest.mark.parametrize("n_nodes", [12, WIDE_UP_TO + 1])
 @pytest.mark.parametrize("form", ["sparse", "dense"])
-def test_propagation_is_the_matrix_product_on_any_trailing_shape(form):
-    operator = GraphOperator(random_edges(12, 20, 4), 12, form=form)
-    x = torch.randn(12, 2, 3, 2, dtype=DOUBLE)
-    expected = np.einsum("ij,jbcd->ibcd", operator.matrix.toarray(), x.numpy())
+def test_propagation_is_the_matrix_product_in_every_channel(form, n_nodes):
+    operator = GraphOperator(random_edges(n_nodes, 2 * n_nodes, 4), n_nodes, form=form)
+    x = torch.randn(3, n_nodes, 2, dtype=DOUBLE)
+    expected = np.stack([operator.matrix @ channel for channel in x.numpy()])
     np.testing.assert_allclose(operator.propagate(x).numpy(), expected, atol=1e-12)
+    start = torch.randn_like(x)
+    added = operator.times(x, start.clone(), add=True)
+    np.testing.assert_allclose(added.numpy(), start.numpy() + expected, atol=1e-12)
 
 
 def test_node_without_edges_keeps_the_row_of_the_identity():
@@ -192,13 +202,13 @@ def test_encoder_and_decoder_have_the_parameters_of_the_paper():
     assert count == 18_103
 
 
-def test_encoder_flattens_nodes_before_channels():
+def test_dense_layer_of_the_encoder_runs_over_channels_then_nodes():
     operator = GraphOperator(random_edges(5, 8, 1), 5)
     encoder = GraphEncoder(operator, 2, (3, 4)).to(DOUBLE)
     x = torch.randn(5, 1, 3, dtype=DOUBLE)
     h = encoder.convolutions(x)[:, 0].detach().numpy()
-    weight = encoder.dense.weight.detach().numpy().reshape(2, 5, 4)
-    expected = np.einsum("rnc,nc->r", weight, h) + encoder.dense.bias.detach().numpy()
+    weight = encoder.dense.weight.detach().numpy().reshape(2, 4, 5)
+    expected = np.einsum("rcn,nc->r", weight, h) + encoder.dense.bias.detach().numpy()
     np.testing.assert_allclose(encoder(x)[0].detach().numpy(), expected, atol=1e-12)
 
 
