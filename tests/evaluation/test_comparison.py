@@ -1,0 +1,82 @@
+"""Which comparisons are honest, and which are refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from evaluation.comparison import agree_on_split, entries
+from evaluation.errors import EvaluationError
+
+
+def test_the_runs_all_models_hold_out_are_the_test_runs(reference, models):
+    split = agree_on_split(reference, models)
+    assert split.test == (9, 10, 11)
+    assert split.train == tuple(range(9))
+
+
+def test_test_runs_may_be_named(reference, models):
+    assert agree_on_split(reference, models, ["run_11", "run_09"]).test == (11, 9)
+
+
+def test_a_model_trained_on_a_test_run_is_refused_by_name(reference, models):
+    with pytest.raises(EvaluationError, match=r"mh was trained on 1 of the 2 test runs \(run_03\)"):
+        agree_on_split(reference, models, ["run_09", "run_03"])
+
+
+def test_a_model_tuned_on_a_test_run_is_refused_too(reference, models):
+    with pytest.raises(EvaluationError, match=r"mh was tuned on 1 of the 1 test runs \(run_08\)"):
+        agree_on_split(reference, models, ["run_08"])
+
+
+def test_different_splits_are_refused(reference, models):
+    other = replace(models[1], held_out_runs=("run_09",))
+    with pytest.raises(EvaluationError, match=r"mh holds out 3 runs .* podnn 1 runs"):
+        agree_on_split(reference, (models[0], other))
+
+
+def test_models_of_another_dataset_are_refused(reference, models):
+    other = replace(models[0], checksum="deadbeef")
+    with pytest.raises(EvaluationError, match="trained on another dataset"):
+        agree_on_split(reference, (other,))
+
+
+def test_no_test_runs_at_all_is_an_error(reference, models):
+    with pytest.raises(EvaluationError, match="no test runs"):
+        agree_on_split(reference, [replace(models[0], held_out_runs=())])
+
+
+def test_a_run_that_does_not_exist_is_named(reference, models):
+    with pytest.raises(EvaluationError, match="run 'run_99' is not in the dataset"):
+        agree_on_split(reference, models, ["run_99"])
+
+
+def test_each_level_is_a_row(models):
+    assert [e.label for e in entries(models)] == ["MH1", "MH2", "MH3", "PODNN", "POD-GPR"]
+
+
+def test_seeds_of_one_configuration_make_one_row(models):
+    seeds = (models[1], replace(models[1], name="podnn-1", seed=1))
+    (row,) = entries(seeds)
+    assert row.keys == ((0, 0), (1, 0))
+
+
+def test_seeds_can_be_kept_apart(models):
+    seeds = (models[1], replace(models[1], name="podnn-1", seed=1))
+    assert [e.label for e in entries(seeds, seeds_as_spread=False)] == ["PODNN (podnn)", "PODNN (podnn-1)"]
+
+
+def test_different_settings_are_no_seeds(models):
+    other = replace(models[1], name="wide", seed=1, configuration={"model": "podnn", "width": 9})
+    assert [e.label for e in entries((models[1], other))] == ["PODNN (podnn)", "PODNN (wide)"]
+
+
+def test_one_model_given_twice_is_refused(models):
+    with pytest.raises(EvaluationError, match="one model given twice"):
+        entries((models[1], replace(models[1], name="copy")))
+
+
+def test_no_model_is_an_error():
+    with pytest.raises(EvaluationError, match="no model"):
+        entries(())

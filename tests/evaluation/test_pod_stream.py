@@ -1,0 +1,120 @@
+"""The streamed decomposition against numpy's SVD of everything at once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evaluation.errors import EvaluationError
+from evaluation.pod import StreamedPod, held, projection_error
+
+
+def _runs(seed: int, count: int, states: int = 4, nodes: int = 7) -> list[np.ndarray]:
+    return [r.astype(np.float32) for r in np.random.default_rng(seed).normal(size=(count, states, nodes, 3))]
+
+
+def _stacked(runs: list[np.ndarray]) -> np.ndarray:
+    return np.concatenate([r.reshape(len(r), -1) for r in runs]).astype(np.float64)
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 10**6), st.integers(1, 5))
+def test_streaming_gives_what_all_at_once_gives(seed, count):
+    runs = _runs(seed, count)
+    stream = StreamedPod(count=21)
+    for run in runs:
+        stream.add(run)
+    pod = stream.result()
+    _, values, vt = np.linalg.svd(_stacked(runs), full_matrices=False)
+    np.testing.assert_allclose(pod.singular_values, values[: len(pod.singular_values)], rtol=1e-4)
+    # Modes are only fixed up to their sign (and rotation where values are close): compare what they span.
+    span = pod.modes.astype(np.float64)
+    np.testing.assert_allclose(span @ span.T, vt.T @ vt, atol=2e-4)
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 10**6), st.integers(2, 6))
+def test_what_truncation_takes_away_is_bounded_by_the_defect(seed, keep):
+    runs = _runs(seed, 6)
+    stream = StreamedPod(count=2, keep=keep)
+    for run in runs:
+        stream.add(run)
+    pod = stream.result()
+    exact = np.linalg.svd(_stacked(runs), compute_uv=False)[:2] ** 2
+    assert (pod.singular_values**2 <= exact * (1 + 1e-5)).all()
+    assert (exact <= (pod.singular_values**2 + pod.defect) * (1 + 1e-5)).all()
+
+
+def test_real_crashes_lose_nothing_worth_naming(reference):
+    stream = StreamedPod(count=10, keep=40)
+    for run in range(12):
+        stream.add(reference.displacement(run))
+    exact = np.linalg.svd(_stacked([reference.displacement(k) for k in range(12)]), compute_uv=False)[:10]
+    np.testing.assert_allclose(stream.result().singular_values, exact, rtol=1e-4)
+
+
+def test_projection_error_is_the_mean_distance_to_the_projection():
+    run = _runs(3, 1)[0]
+    modes = np.linalg.qr(np.random.default_rng(4).normal(size=(21, 3)))[0]
+    errors = projection_error(run, modes)
+    assert errors.shape == (3, 4)
+    for r in range(3):
+        v = modes[:, : r + 1]
+        rest = (run.reshape(4, -1) - (run.reshape(4, -1) @ v) @ v.T).reshape(run.shape)
+        np.testing.assert_allclose(errors[r], np.linalg.norm(rest, axis=-1).mean(axis=1), rtol=1e-4)
+
+
+def test_all_modes_of_a_run_project_it_on_itself():
+    run = _runs(5, 1)[0]
+    stream = StreamedPod(count=4)
+    stream.add(run)
+    assert projection_error(run, stream.result().modes)[-1].max() < 1e-5 * np.abs(run).max()
+
+
+def test_projecting_leaves_the_run_as_it_was():
+    run = _runs(6, 1)[0]
+    before = run.copy()
+    projection_error(run, np.linalg.qr(np.ones((21, 1)))[0])
+    np.testing.assert_array_equal(run, before)
+
+
+def test_nodes_that_are_gone_stay_where_they_were_last_seen():
+    u = np.arange(24, dtype=float).reshape(4, 2, 3)
+    u[2:, 1] = np.nan
+    filled = held(u)
+    np.testing.assert_array_equal(filled[2, 1], u[1, 1])
+    np.testing.assert_array_equal(filled[3, 1], u[1, 1])
+    np.testing.assert_array_equal(filled[:, 0], u[:, 0])
+
+
+def test_gone_nodes_take_no_part_in_the_projection_error(eroded, reference):
+    whole = projection_error(reference.displacement(0)[:, 50:], np.eye(3 * (reference.n_nodes - 50), 1))
+    stream_modes = np.zeros((3 * reference.n_nodes, 1))
+    stream_modes[150, 0] = 1.0
+    masked = projection_error(eroded.displacement(0), stream_modes)
+    np.testing.assert_allclose(masked[0, 2:], whole[0, 2:], rtol=1e-5)
+
+
+def test_runs_on_different_meshes_are_an_error():
+    stream = StreamedPod(2)
+    stream.add(np.ones((2, 3, 3)))
+    with pytest.raises(EvaluationError, match="run of 4 nodes follows runs of 3"):
+        stream.add(np.ones((2, 4, 3)))
+
+
+def test_modes_of_another_mesh_are_an_error():
+    with pytest.raises(EvaluationError, match="modes have 2 nodes and the run 3"):
+        projection_error(np.ones((1, 3, 3)), np.ones((6, 1)))
+
+
+def test_nothing_to_decompose_is_an_error():
+    with pytest.raises(EvaluationError, match="no run"):
+        StreamedPod(2).result()
+    still = StreamedPod(2)
+    still.add(np.zeros((2, 3, 3)))
+    with pytest.raises(EvaluationError, match="nothing moves"):
+        still.result()
+    with pytest.raises(EvaluationError, match="0 modes"):
+        StreamedPod(0)
