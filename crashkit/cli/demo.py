@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from typing import Annotated
 
 import typer
 
+from crashkit import __version__
 from crashkit.cli._console import fail, say, table
 
 # As in the kart data's README: the first 27 of 36 runs train, the last 9 test.
@@ -71,20 +73,37 @@ def steps(output: Path, source: Path) -> list[Step]:
 
 
 def run_steps(todo: list[Step], done_file: Path) -> None:
-    """Run the steps one after the other; those whose command and result are there from last time are skipped."""
-    done: list[str] = json.loads(done_file.read_text()) if done_file.exists() else []
+    """Run the steps in order; those that ended well last time, with the same command and version, are skipped.
+
+    From the first step that is run on, all are run: what they read has changed.
+    """
+    before: list[str] = json.loads(done_file.read_text()) if done_file.exists() else []
+    done: list[str] = []
+    renewed = False
     for number, step in enumerate(todo, 1):
         line = "crashkit " + shlex.join(step.arguments)
         say(f"\n[{number}/{len(todo)}] {step.why}\n$ {line}")
-        if step.result is not None and line in done and step.result.exists():
-            say("  (done before)")
-            continue
+        mark = f"{__version__}: {line}"
+        if step.result is not None and step.result.exists():
+            if not renewed and before[number - 1 : number] == [mark]:
+                say("  (done before; --fresh starts again)")
+                done.append(mark)
+                continue
+            _remove(step.result)
+        renewed = renewed or step.result is not None
         code = subprocess.run([sys.executable, "-m", "crashkit", *step.arguments], check=False).returncode
         if code:
             fail(f"step {number} of the demo ended with code {code}; its message stands above", code=code)
-        # A step that is run again makes those behind it stale.
-        done = [*done[: number - 1], line] if line not in done else done[: done.index(line) + 1]
+        done.append(mark)
         done_file.write_text(json.dumps(done))
+
+
+def _remove(result: Path) -> None:
+    """Make room for a result that is made again."""
+    if result.is_dir():
+        shutil.rmtree(result)
+    else:
+        result.unlink()
 
 
 def command(
@@ -97,20 +116,37 @@ def command(
     from crashkit.dataset import demo_data
     from crashkit.errors import OutputError
 
+    done_file = output / "done.json"
     try:
         output.mkdir(parents=True, exist_ok=True)
+        if fresh:
+            done_file.unlink(missing_ok=True)
+        done_file.touch()
+        if done_file.stat().st_size == 0:
+            done_file.write_text("[]")
     except OSError as error:
-        raise OutputError(f"{output}: cannot be made a folder ({error.strerror}); choose another with -o") from error
-    done_file = output / "done.json"
-    if fresh:
-        done_file.unlink(missing_ok=True)
+        raise OutputError(f"{output}: cannot be written ({error.strerror}); choose another folder with -o") from error
     run_steps(steps(output, demo_data()), done_file)
     show_result(output)
 
 
 def show_result(output: Path) -> None:
-    """The table of errors from the report's own numbers, and the paths worth opening."""
-    numbers = json.loads((output / "report" / "report.json").read_text())
+    """The errors from the report's own numbers, and the paths worth opening."""
+    rows = json.loads((output / "report" / "report.json").read_text())["performance"]
     say("")
-    print(numbers.keys())
-    table("", (), ())
+    table(
+        "Mean node error on runs no model has seen, lifted to the full mesh",
+        ("model", "error (cm)", "worst run (cm)", "POD floor (cm)"),
+        (
+            (r["model"], f"{r['error_cm']:.2f}", f"{r['worst_run_cm']:.2f}", f"{r['pod_floor_cm']:.2f}")
+            for r in sorted(rows, key=lambda r: -float(r["error_cm"]))
+        ),
+    )
+    say("Open next:")
+    for path, what in (
+        (output / "report" / "report.html", "the report, in a browser"),
+        (output / "report" / "vtk", "truth, prediction and error of two runs, in ParaView (.pvd or .vtkhdf)"),
+        (output / "new_crash.pvd", "a crash nobody computed, in ParaView"),
+        (output / "levels.png", "the meshes the surrogate works on"),
+    ):
+        say(f"  {path}  {what}")
