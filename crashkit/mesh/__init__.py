@@ -18,9 +18,11 @@ _LAZY = {
     "level_displacement": "store",
     "lift": "lifting",
     "read_hierarchy": "store",
+    "refine": "refine",
     "summarize_hierarchy": "store",
     "surface": "surface",
     "write_hierarchy": "store",
+    "write_levels": "export",
 }
 
 __all__ = list(_LAZY)

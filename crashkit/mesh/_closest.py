@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 
 @njit(cache=True)
-def _on_segment(p, a, b):
-    """Weight of b at the point of the segment a-b closest to p."""
+def _on_segment(points: NDArray, i: int, at: NDArray, a: int, b: int) -> float:
+    """Weight of b at the point of the segment a-b closest to point i."""
     along = 0.0
     length2 = 0.0
     for k in range(3):
-        d = b[k] - a[k]
-        along += d * (p[k] - a[k])
+        d = at[b, k] - at[a, k]
+        along += d * (points[i, k] - at[a, k])
         length2 += d * d
     if length2 <= 0.0:
         return 0.0
@@ -21,37 +22,34 @@ def _on_segment(p, a, b):
 
 
 @njit(cache=True)
-def _distance2(p, at, cell, w):
+def _to_segment2(points: NDArray, i: int, at: NDArray, a: int, b: int, t: float) -> float:
+    """Squared distance of point i to the point (1 - t) a + t b."""
     total = 0.0
     for k in range(3):
-        d = -p[k]
-        for corner in range(3):
-            if cell[corner] >= 0:
-                d += w[corner] * at[cell[corner], k]
+        d = (1.0 - t) * at[a, k] + t * at[b, k] - points[i, k]
         total += d * d
     return total
 
 
 @njit(cache=True)
-def weights_on(p, at, cell, w):
-    """Barycentric weights `w` (3,) of the point of `cell` closest to p, clamped; returns the squared distance.
+def closest_weights(
+    points: NDArray, i: int, at: NDArray, cells: NDArray, cell: int
+) -> tuple[float, float, float, float]:
+    """Barycentric weights of the point of a cell closest to point i, clamped to the cell, and its squared distance.
 
     A cell has three nodes (triangle), two (segment) or one; -1 fills the rest. A degenerate triangle is the union of
-    its sides.
+    its sides. Everything is passed as arrays and numbers of rows: numba is slow at rows as arrays of their own.
     """
-    w[0], w[1], w[2] = 1.0, 0.0, 0.0
-    if cell[1] < 0:
-        return _distance2(p, at, cell, w)
-    a, b = at[cell[0]], at[cell[1]]
-    if cell[2] < 0:
-        t = _on_segment(p, a, b)
-        w[0], w[1] = 1.0 - t, t
-        return _distance2(p, at, cell, w)
-    c = at[cell[2]]
-    # Inside: solve for the foot of the perpendicular.
+    a, b, c = cells[cell, 0], cells[cell, 1], cells[cell, 2]
+    if b < 0:
+        return 1.0, 0.0, 0.0, _to_segment2(points, i, at, a, a, 0.0)
+    t0 = _on_segment(points, i, at, a, b)
+    if c < 0:
+        return 1.0 - t0, t0, 0.0, _to_segment2(points, i, at, a, b, t0)
+    # Inside: the foot of the perpendicular.
     aa, ab, bb, ap, bp = 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(3):
-        e, f, g = b[k] - a[k], c[k] - a[k], p[k] - a[k]
+        e, f, g = at[b, k] - at[a, k], at[c, k] - at[a, k], points[i, k] - at[a, k]
         aa += e * e
         ab += e * f
         bb += f * f
@@ -62,33 +60,30 @@ def weights_on(p, at, cell, w):
         v = (bb * ap - ab * bp) / det
         u = (aa * bp - ab * ap) / det
         if v >= 0.0 and u >= 0.0 and v + u <= 1.0:
-            w[0], w[1], w[2] = max(0.0, 1.0 - v - u), v, u
-            return _distance2(p, at, cell, w)
+            d2 = 0.0
+            for k in range(3):
+                d = (1.0 - v - u) * at[a, k] + v * at[b, k] + u * at[c, k] - points[i, k]
+                d2 += d * d
+            return 1.0 - v - u, v, u, d2
     # Outside or degenerate: the closest of the three sides.
-    t0, t1, t2 = _on_segment(p, a, b), _on_segment(p, b, c), _on_segment(p, c, a)
-    best = np.inf
-    keep = 0
-    for side in range(3):
-        if side == 0:
-            w[0], w[1], w[2] = 1.0 - t0, t0, 0.0
-        elif side == 1:
-            w[0], w[1], w[2] = 0.0, 1.0 - t1, t1
-        else:
-            w[0], w[1], w[2] = t2, 0.0, 1.0 - t2
-        d = _distance2(p, at, cell, w)
-        if d < best:
-            best, keep = d, side
-    if keep == 0:
-        w[0], w[1], w[2] = 1.0 - t0, t0, 0.0
-    elif keep == 1:
-        w[0], w[1], w[2] = 0.0, 1.0 - t1, t1
-    else:
-        w[0], w[1], w[2] = t2, 0.0, 1.0 - t2
-    return best
+    t1, t2 = _on_segment(points, i, at, b, c), _on_segment(points, i, at, c, a)
+    d0, d1, d2 = (
+        _to_segment2(points, i, at, a, b, t0),
+        _to_segment2(points, i, at, b, c, t1),
+        _to_segment2(points, i, at, c, a, t2),
+    )
+    if d0 <= d1 and d0 <= d2:
+        return 1.0 - t0, t0, 0.0, d0
+    if d1 <= d2:
+        return 0.0, 1.0 - t1, t1, d1
+    return t2, 0.0, 1.0 - t2, d2
 
 
 @njit(cache=True)
-def settle(points, start, candidate, at, cells, cell_start, cell_list, near_start, near_list, hops):
+def settle(
+    points: NDArray, start: NDArray, candidate: NDArray, at: NDArray, cells: NDArray, cell_start: NDArray,
+    cell_list: NDArray, near_start: NDArray, near_list: NDArray, hops: int,
+) -> tuple[NDArray, NDArray, NDArray, NDArray]:  # fmt: skip
     """Weights of each point on its cell, taking `candidate` where the graph agrees that it is near.
 
     points (n, 3); start (n,): the coarse node that stands for each point; candidate (n,): closest cell found without
@@ -106,7 +101,6 @@ def settle(points, start, candidate, at, cells, cell_start, cell_list, near_star
     seen = np.full(len(at), -1, np.int64)
     looked = np.full(len(cells), -1, np.int64)
     reached = np.empty(len(at), np.int64)
-    w = np.empty(3)
     for i in range(n):
         reached[0] = start[i]
         seen[start[i]] = i
@@ -134,11 +128,10 @@ def settle(points, start, candidate, at, cells, cell_start, cell_list, near_star
                     other = cell_list[j]
                     if looked[other] != i:
                         looked[other] = i
-                        d = weights_on(points[i], at, cells[other], w)
+                        d = closest_weights(points, i, at, cells, other)[3]
                         if d < best:
                             best, c = d, other
             overruled[i] = True
-        distance2[i] = weights_on(points[i], at, cells[c], w)
+        weights[i, 0], weights[i, 1], weights[i, 2], distance2[i] = closest_weights(points, i, at, cells, c)
         cell_of[i] = c
-        weights[i] = w
     return cell_of, weights, distance2, overruled

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 _NONE = -1
 
 
 @njit(cache=True)
-def _evaluate(q, x, y, z):
+def _evaluate(q: NDArray, x: float, y: float, z: float) -> float:
     """v^T Q v of a quadric stored as xx xy xz xw yy yz yw zz zw ww."""
     return (
         q[0] * x * x + 2 * q[1] * x * y + 2 * q[2] * x * z + 2 * q[3] * x
@@ -23,7 +24,7 @@ def _evaluate(q, x, y, z):
 
 
 @njit(cache=True)
-def _add_plane(q, nx, ny, nz, d, w):
+def _add_plane(q: NDArray, nx: float, ny: float, nz: float, d: float, w: float) -> None:
     q[0] += w * nx * nx
     q[1] += w * nx * ny
     q[2] += w * nx * nz
@@ -37,7 +38,7 @@ def _add_plane(q, nx, ny, nz, d, w):
 
 
 @njit(cache=True)
-def _add_point(q, x, y, z, w):
+def _add_point(q: NDArray, x: float, y: float, z: float, w: float) -> None:
     """w |v - (x, y, z)|^2."""
     q[0] += w
     q[4] += w
@@ -49,7 +50,9 @@ def _add_point(q, x, y, z, w):
 
 
 @njit(cache=True)
-def quadrics(position, faces, edges, edge_faces, edge_face, boundary, spread):
+def quadrics(
+    position: NDArray, faces: NDArray, edges: NDArray, edge_faces: NDArray, edge_face: NDArray, boundary: float, spread: float
+) -> NDArray:  # fmt: skip
     """Ten numbers a vertex: planes of its faces, planes across its open or branching edges, its own place.
 
     `edge_faces` counts the faces of an edge, `edge_face` names one of them. `boundary` and `spread` weigh the
@@ -102,14 +105,14 @@ def quadrics(position, faces, edges, edge_faces, edge_face, boundary, spread):
 
 
 @njit(cache=True)
-def _less(cost, tie, a, b):
+def _less(cost: NDArray, tie: NDArray, a: int, b: int) -> bool:
     if cost[a] != cost[b]:
         return cost[a] < cost[b]
     return tie[a] < tie[b]
 
 
 @njit(cache=True)
-def _sift(heap, where, cost, tie, k, size):
+def _sift(heap: NDArray, where: NDArray, cost: NDArray, tie: NDArray, k: int, size: int) -> None:
     """Put the entry at place k of the first `size` where it belongs, upwards or downwards."""
     v = heap[k]
     while k > 0:
@@ -135,7 +138,9 @@ def _sift(heap, where, cost, tie, k, size):
 
 
 @njit(cache=True)
-def _flips(p, q, position, faces, face_head, face_next):
+def _flips(
+    p: int, q: int, position: NDArray, faces: NDArray, face_head: NDArray, face_next: NDArray
+) -> int:  # fmt: skip
     """How many of p's surviving faces would turn over if p moved to q."""
     count = 0
     c = face_head[p]
@@ -171,16 +176,19 @@ def _flips(p, q, position, faces, face_head, face_next):
 
 
 @njit(cache=True)
-def _holds_all(parts, p, q):
+def _holds_all(parts: NDArray, p: int, q: int) -> bool:
     """Whether q lies on every part that p lies on."""
-    for w in range(parts.shape[1]):
+    for w in range(parts.shape[1]):  # noqa: SIM110 - numba compiles no generator here
         if parts[p, w] & ~parts[q, w]:
             return False
     return True
 
 
 @njit(cache=True)
-def _best(p, position, quadric, faces, face_head, face_next, half_to, half_head, half_next, parts, join_parts, flip):
+def _best(
+    p: int, position: NDArray, quadric: NDArray, faces: NDArray, face_head: NDArray, face_next: NDArray,
+    half_to: NDArray, half_head: NDArray, half_next: NDArray, parts: NDArray, join_parts: bool, flip: float,
+) -> tuple[float, int]:  # fmt: skip
     """Cheapest contraction p -> q, as (cost, q); q is -1 where none is allowed."""
     best, target = np.inf, _NONE
     h = half_head[p]
@@ -198,7 +206,7 @@ def _best(p, position, quadric, faces, face_head, face_next, half_to, half_head,
 
 
 @njit(cache=True)
-def _unlink_corner(c, faces, face_head, face_next):
+def _unlink_corner(c: int, faces: NDArray, face_head: NDArray, face_next: NDArray) -> None:
     v = faces[c // 3, c % 3]
     at = face_head[v]
     if at == c:
@@ -210,7 +218,7 @@ def _unlink_corner(c, faces, face_head, face_next):
 
 
 @njit(cache=True)
-def _drop_half(v, h, half_head, half_next):
+def _drop_half(v: int, h: int, half_head: NDArray, half_next: NDArray) -> None:
     at = half_head[v]
     if at == h:
         half_head[v] = half_next[h]
@@ -221,7 +229,9 @@ def _drop_half(v, h, half_head, half_next):
 
 
 @njit(cache=True)
-def _has_twin(q, a, b, part, faces, face_part, face_head, face_next):
+def _has_twin(
+    q: int, a: int, b: int, part: int, faces: NDArray, face_part: NDArray, face_head: NDArray, face_next: NDArray
+) -> bool:  # fmt: skip
     """Whether q already carries a face of this part with the corners q, a, b."""
     c = face_head[q]
     while c != _NONE:
@@ -236,7 +246,10 @@ def _has_twin(q, a, b, part, faces, face_part, face_head, face_next):
 
 
 @njit(cache=True)
-def contract(position, quadric, faces, face_part, edges, is_pair, parts, tie, locked, count, join_parts, flip):
+def contract(
+    position: NDArray, quadric: NDArray, faces: NDArray, face_part: NDArray, edges: NDArray, is_pair: NDArray,
+    parts: NDArray, tie: NDArray, locked: NDArray, count: int, join_parts: bool, flip: float,
+) -> tuple[NDArray, NDArray, NDArray]:  # fmt: skip
     """Contract p -> q, cheapest first, until `count` vertices are left or no contraction is allowed.
 
     position (n, 3), quadric (n, 10), faces (m, 3) int32, face_part (m,) int32, edges (e, 2) int32 without doubles,
@@ -275,19 +288,8 @@ def contract(position, quadric, faces, face_part, edges, is_pair, parts, tie, lo
     for v in range(n):
         if not locked[v]:
             cost[v], target[v] = _best(
-                v,
-                position,
-                quadric,
-                faces,
-                face_head,
-                face_next,
-                half_to,
-                half_head,
-                half_next,
-                parts,
-                join_parts,
-                flip,
-            )
+                v, position, quadric, faces, face_head, face_next, half_to, half_head, half_next, parts, join_parts, flip
+            )  # fmt: skip
     for k in range(n // 2, -1, -1):
         _sift(heap, where, cost, tie, k, n)
 
@@ -361,38 +363,16 @@ def contract(position, quadric, faces, face_part, edges, is_pair, parts, tie, lo
         # The costs of q and its neighbours changed.
         if not locked[q]:
             cost[q], target[q] = _best(
-                q,
-                position,
-                quadric,
-                faces,
-                face_head,
-                face_next,
-                half_to,
-                half_head,
-                half_next,
-                parts,
-                join_parts,
-                flip,
-            )
+                q, position, quadric, faces, face_head, face_next, half_to, half_head, half_next, parts, join_parts, flip
+            )  # fmt: skip
             _sift(heap, where, cost, tie, where[q], left)
         h = half_head[q]
         while h != _NONE:
             r = half_to[h]
             if not locked[r]:
                 cost[r], target[r] = _best(
-                    r,
-                    position,
-                    quadric,
-                    faces,
-                    face_head,
-                    face_next,
-                    half_to,
-                    half_head,
-                    half_next,
-                    parts,
-                    join_parts,
-                    flip,
-                )
+                r, position, quadric, faces, face_head, face_next, half_to, half_head, half_next, parts, join_parts, flip
+            )  # fmt: skip
                 _sift(heap, where, cost, tie, where[r], left)
             h = half_next[h]
 
@@ -406,3 +386,44 @@ def contract(position, quadric, faces, face_part, edges, is_pair, parts, tie, lo
             into[at] = end
             at = following
     return into, face_lives, edge_lives
+
+
+@njit(cache=True)
+def graph_distances(
+    pairs: NDArray, limit: NDArray, position: NDArray, near_start: NDArray, near_list: NDArray
+) -> NDArray:
+    """Length of the shortest way along the graph between the two vertices of each pair; inf where above `limit`.
+
+    pairs (m, 2), limit (m,), position (n, 3); neighbours of v: near_list[near_start[v]:near_start[v + 1]].
+    """
+    n = len(position)
+    out = np.full(len(pairs), np.inf)
+    length = np.empty(n)
+    stamp = np.full(n, _NONE)
+    queued = np.full(n, _NONE)
+    queue = np.empty(n, np.int64)
+    for m in range(len(pairs)):
+        a, b = pairs[m]
+        length[a], stamp[a] = 0.0, m
+        queue[0], queued[a] = a, m
+        first, waiting = 0, 1
+        while waiting > 0:
+            v = queue[first]
+            first = (first + 1) % n
+            waiting -= 1
+            queued[v] = _NONE
+            for k in range(near_start[v], near_start[v + 1]):
+                r = near_list[k]
+                step = 0.0
+                for xyz in range(3):
+                    step += (position[r, xyz] - position[v, xyz]) ** 2
+                way = length[v] + np.sqrt(step)
+                if way <= limit[m] and (stamp[r] != m or way < length[r]):
+                    length[r], stamp[r] = way, m
+                    if queued[r] != m:
+                        queue[(first + waiting) % n] = r
+                        waiting += 1
+                        queued[r] = m
+        if stamp[b] == m:
+            out[m] = length[b]
+    return out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -13,6 +14,7 @@ from crashkit.errors import MeshError
 from crashkit.mesh.levels import Hierarchy, Level
 from crashkit.mesh.probe import coarse_cells, probe_map
 from crashkit.mesh.selection import Selection, select_quadric
+from crashkit.mesh.selection_vtk import select_vtk
 from crashkit.mesh.surface import Surface, surface
 
 SelectionName = Literal["quadric", "vtk"]
@@ -53,13 +55,8 @@ def build_hierarchy(
         pair_distance = PAIR_SHARE * mesh.diagonal
     if not (np.isfinite(pair_distance) and pair_distance >= 0):
         raise MeshError(f"pair distance {pair_distance}; expected metres, 0 or more")
-    select = _select(selection)
-    selections = select(mesh, wanted, pair_distance)
+    selections = (select_vtk if selection == "vtk" else select_quadric)(mesh, wanted, pair_distance)
     return assemble(mesh, selections, {"selection": selection, "pair_distance": float(pair_distance), "counts": wanted})
-
-
-def _select(name: SelectionName):
-    return select_quadric
 
 
 def ratios_to_counts(n_nodes: int, ratios: Sequence[float]) -> list[int]:
@@ -74,12 +71,12 @@ def check_counts(mesh: Surface, counts: Sequence[int]) -> list[int]:
     """The counts as integers; raises MeshError if they are not decreasing or not below the nodes there are."""
     wanted = [int(c) for c in counts]
     said = ", ".join(map(str, wanted))
-    if not wanted or any(c != d for c, d in zip(wanted, counts)) or min(wanted) < 1:
+    if not wanted or any(c != d for c, d in zip(wanted, counts, strict=True)) or min(wanted) < 1:
         raise MeshError(f"node counts {said or 'missing'}; expected whole numbers of at least 1, such as 1165,292,73")
     available = int(mesh.used.sum())
     if wanted[0] > available:
         raise MeshError(f"{wanted[0]} nodes were asked for, but only {available} nodes lie on faces; ask for fewer")
-    if any(a <= b for a, b in zip(wanted, wanted[1:])):
+    if any(a <= b for a, b in pairwise(wanted)):
         raise MeshError(f"node counts {said} do not decrease; expected each level smaller than the one before")
     return wanted
 
@@ -114,4 +111,5 @@ def _level(mesh: Surface, index: int, chosen: Selection, finer: NDArray[np.int64
         to_finer=to_finer,
         to_full=to_full,
         distance=distance,
+        face_part=chosen.part,
     )

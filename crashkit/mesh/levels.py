@@ -25,6 +25,7 @@ class Level:
     to_finer    csr (n of next finer level, n): U one level up; rows sum to 1, >= 0
     to_full     csr (n of level 0, n): U straight to level 0
     distance    (n of level 0,) float64, m: distance of each fine node to the coarse surface
+    face_part   (m,) int32: part of each face as in the dataset; None where the mesh was given without parts
     """
 
     index: int
@@ -35,6 +36,7 @@ class Level:
     to_finer: sparse.csr_matrix
     to_full: sparse.csr_matrix
     distance: NDArray[np.float64]
+    face_part: NDArray[np.int32] | None = None
 
     @property
     def n_nodes(self) -> int:

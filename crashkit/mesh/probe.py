@@ -8,6 +8,7 @@ and therefore every affine field a + B x up to B (c - x): its error is at most |
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +17,12 @@ from scipy.spatial import cKDTree
 
 from crashkit.mesh.surface import adjacency, unique_pairs
 
+if TYPE_CHECKING:
+    from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
+
 # The closest cell is trusted if it can be reached in this many coarse edges from the node that a fine node was
 # contracted into; otherwise it lies on another sheet of the same part.
-HOPS = 2
+HOPS = 1
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,7 @@ def coarse_cells(faces: NDArray, part: NDArray, edges: NDArray, parts: NDArray[n
         member = (parts[:, word] >> bit & np.uint64(1)).astype(bool)
         triangles = faces[part == p].astype(np.int64)
         within = edges[member[edges].all(axis=1)]
-        segments = _without_sides(within, triangles)
+        segments = without_sides(within, triangles)
         alone = member.copy()
         alone[triangles] = False
         alone[segments] = False
@@ -87,7 +91,7 @@ def probe_map(
     if len(rows):
         candidate = closest_cells(points[rows], parts[rows], coarse, cells)
         graph = adjacency(k, edges)
-        cell_start, cell_list = _cells_of_nodes(cells.nodes, k)
+        cell_start, cell_list = cells_of_nodes(cells.nodes, k)
         found, weight, _, _ = _closest.settle(
             points[rows], into[rows].astype(np.int64), candidate, coarse, cells.nodes,
             cell_start, cell_list, graph.indptr, graph.indices, hops,
@@ -136,14 +140,17 @@ def _locate(
     locator.BuildLocator()
     cell, number, sub, distance2, foot = vtkGenericCell(), reference(0), reference(0), reference(0.0), [0.0, 0.0, 0.0]
     out, squared = np.empty(len(points), np.int64), np.empty(len(points))
-    find = locator.FindClosestPoint
+    # VTK's type hints know no references, which its functions with results in arguments need.
+    find: Any = locator.FindClosestPoint
+    out_number: Any = number
+    out_distance2: Any = distance2
     for k, point in enumerate(points.tolist()):
         find(point, foot, cell, number, sub, distance2)
-        out[k], squared[k] = number.get(), distance2.get()
+        out[k], squared[k] = out_number.get(), out_distance2.get()
     return out, squared
 
 
-def _grid(coarse: NDArray[np.float64], nodes: NDArray[np.int64]):
+def _grid(coarse: NDArray[np.float64], nodes: NDArray[np.int64]) -> vtkUnstructuredGrid:
     from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
     from vtkmodules.vtkCommonCore import vtkPoints
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
@@ -165,7 +172,8 @@ def _grid(coarse: NDArray[np.float64], nodes: NDArray[np.int64]):
     return grid
 
 
-def _cells_of_nodes(nodes: NDArray[np.int64], k: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def cells_of_nodes(nodes: NDArray[np.int64], k: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The cells (c, 3) that touch each of k nodes, as (start (k + 1,), list): those of v are list[start[v]:start[v + 1]]."""
     valid = nodes >= 0
     cell = np.broadcast_to(np.arange(len(nodes))[:, None], nodes.shape)[valid]
     node = nodes[valid]
@@ -173,11 +181,12 @@ def _cells_of_nodes(nodes: NDArray[np.int64], k: int) -> tuple[NDArray[np.int64]
     return np.concatenate([[0], np.cumsum(np.bincount(node, minlength=k))]), cell[order]
 
 
-def _without_sides(edges: NDArray, triangles: NDArray[np.int64]) -> NDArray[np.int64]:
-    edges = edges.astype(np.int64)
-    if len(triangles) == 0 or len(edges) == 0:
-        return edges
+def without_sides(edges: NDArray[np.integer], triangles: NDArray[np.integer]) -> NDArray[np.int64]:
+    """The edges (e, 2) that are no side of any of the triangles (m, 3): lone edges."""
+    pairs: NDArray[np.int64] = edges.astype(np.int64)
+    if len(triangles) == 0 or len(pairs) == 0:
+        return pairs
     sides = unique_pairs(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)).astype(np.int64)
-    width = int(max(sides.max(), edges.max())) + 1
-    low, high = edges.min(axis=1), edges.max(axis=1)
-    return edges[~np.isin(low * width + high, sides[:, 0] * width + sides[:, 1])]
+    width = int(max(sides.max(), pairs.max())) + 1
+    low, high = pairs.min(axis=1), pairs.max(axis=1)
+    return pairs[~np.isin(low * width + high, sides[:, 0] * width + sides[:, 1])]

@@ -2,7 +2,8 @@
 
 Garland and Heckbert (1997), restricted to contractions p -> q in which q keeps its place, so that the kept nodes are
 a subset of the original ones. What is contracted is a graph with faces on it: when the last face of a thin tube
-vanishes its edges stay, and the tube lives on as a chain.
+vanishes its edges stay, and the tube lives on as a chain. Afterwards each kept node may change places with a
+neighbour where that lowers a bound on the error of lifting (docs/mesh.md).
 """
 
 from __future__ import annotations
@@ -14,24 +15,32 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from crashkit.errors import MeshError
-from crashkit.mesh.surface import Surface, unique_pairs
+from crashkit.mesh.surface import Surface, adjacency, unique_pairs
 
-# Weights against the area-weighted squared distances to the planes of the faces (see docs/mesh.md for how the
-# second was found): open and branching edges, and the distance of a contracted node from the one that stands for it.
-BOUNDARY = 1.0
-SPREAD = 0.02
-# A contraction that turns faces over costs this much more for every face.
-FLIP = 1.0
+# Weights beside the area-weighted squared distances to the planes of the faces: planes across open and branching
+# edges, and the squared distance of a contracted node from the one that stands for it. Found on training runs.
+BOUNDARY = 10.0
+SPREAD = 0.005
+# A contraction costs this much more for every face it turns over.
+FLIP = 10.0
+# Fields are taken to turn over on this share of the mesh's diagonal when kept nodes change places.
+CURVATURE = 0.2
+SWEEPS = 3
+# Close pairs: how much farther apart along the graph than through space, and how many neighbours are looked at.
+_DETOUR = 4.0
+_NEIGHBOURS = 16
+# Nodes closer than this share of the diagonal lie at the same place.
+_SAME_PLACE = 1e-6
 
 
 @dataclass(frozen=True)
 class Selection:
     """The nodes one level keeps and the mesh between them, all as node numbers of level 0.
 
-    kept    (n,) int64, increasing
+    kept    (k,) int64, increasing
     faces   (m, 3) int32, part (m,) int32
     edges   (e, 2) int32, i < j
-    parts   (n, words) uint64: bit sets of the parts of each kept node
+    parts   (k, words) uint64: bit sets of the parts of each kept node
     into    (n of level 0,) int32: the kept node that stands for each node; -1 for nodes no face touches
     """
 
@@ -43,6 +52,13 @@ class Selection:
     into: NDArray[np.int32]
 
 
+def everything(mesh: Surface) -> Selection:
+    """The selection that keeps all nodes of faces: where every contraction starts."""
+    kept = np.flatnonzero(mesh.used)
+    into = np.where(mesh.used, np.arange(mesh.n_nodes), -1).astype(np.int32)
+    return Selection(kept, mesh.triangles, mesh.part, mesh.edges, mesh.node_parts[kept], into)
+
+
 def select_quadric(
     mesh: Surface,
     counts: list[int],
@@ -50,39 +66,59 @@ def select_quadric(
     *,
     boundary: float = BOUNDARY,
     spread: float = SPREAD,
-    flip: float = FLIP,
+    curvature: float = CURVATURE,
+    sweeps: int = SWEEPS,
 ) -> list[Selection]:
     """One selection for each of `counts` (decreasing), every one a subset of the one before.
 
-    `pair_distance`, m: nodes of one part closer than this may contract without sharing an edge.
+    `pair_distance`, m: nodes of one part closer than this may contract without sharing an edge, see `_close_pairs`.
     The result does not depend on the order of nodes or faces, up to nodes at the very same place.
 
     Raises MeshError if a count cannot be reached because every part must keep a node.
     """
-    from crashkit.mesh import _contraction
-
-    scale = mesh.diagonal or 1.0
-    nodes, state = _canonical(mesh, scale)
-    edge_faces, edge_face = _faces_of_edges(state.faces, state.edges)
-    state.quadric = _contraction.quadrics(state.at, state.faces, state.edges, edge_faces, edge_face, boundary, spread)
+    base = everything(mesh)
+    nodes, state = _start(mesh, base, boundary, spread)
     chain = np.full(mesh.n_nodes, -1, np.int32)
     chain[nodes] = np.arange(len(nodes))
+    weight: NDArray[np.float64] = np.ones(len(nodes))
     selections = []
     for count in counts:
-        while len(nodes) > count:
-            step = max(count, len(nodes) // 2)
-            kept, into = _contract_to(state, step, pair_distance / scale, flip)
-            if len(kept) == len(nodes):
-                if state.join_parts:
-                    raise MeshError(
-                        f"{count} nodes were asked for, but parts without common nodes need at least {len(nodes)}, "
-                        "one each; ask for more nodes"
-                    )
-                state.join_parts = True
-            nodes = nodes[kept]
-            chain = np.where(chain >= 0, into[chain], -1)
-        selections.append(_selection(mesh, nodes, state, chain))
+        finer_at, finer_parts, finer_edges = state.at, state.parts, state.edges
+        kept, into = _contract(state, count, pair_distance / _scale(mesh))
+        if sweeps:
+            kept, into = _relocate(
+                state, kept, into, finer_at, finer_parts, finer_edges, weight, mesh.n_parts, curvature, sweeps
+            )
+        nodes, weight = nodes[kept], np.bincount(into, weight, minlength=count).astype(np.float64)
+        chain = np.where(chain >= 0, into[chain], -1)
+        selections.append(_selection(nodes, state, chain))
     return selections
+
+
+def contract_onto(mesh: Surface, base: Selection, keep: NDArray[np.integer]) -> Selection:
+    """The mesh that is left of `base` when exactly the nodes `keep` (numbers of level 0, some of its own) stay.
+
+    Raises MeshError if a part, with those it shares nodes with, has no node in `keep`.
+    """
+    return _contract_base(mesh, base, np.isin(base.kept, keep), 0, 0.0)
+
+
+def contract_to(mesh: Surface, base: Selection, count: int, pair_distance: float = 0.0) -> Selection:
+    """The mesh that is left of `base` when it is contracted to `count` nodes, cheapest first."""
+    return _contract_base(mesh, base, np.zeros(len(base.kept), bool), count, pair_distance)
+
+
+def _contract_base(
+    mesh: Surface, base: Selection, stays: NDArray[np.bool_], count: int, pair_distance: float
+) -> Selection:
+    nodes, state = _start(mesh, base, BOUNDARY, SPREAD)
+    own = np.full(mesh.n_nodes, -1, np.int32)
+    own[nodes] = np.arange(len(nodes))
+    chain = np.where(base.into >= 0, own[base.into], -1)
+    locked = np.zeros(len(nodes), bool)
+    locked[own[base.kept[stays]]] = True
+    kept, into = _contract(state, max(count, int(stays.sum())), pair_distance / _scale(mesh), locked)
+    return _selection(nodes[kept], state, np.where(chain >= 0, into[chain], -1))
 
 
 @dataclass
@@ -96,29 +132,36 @@ class _State:
     edges: NDArray[np.int32]
     parts: NDArray[np.uint64]
     tie: NDArray[np.int64]
-    join_parts: bool = False
 
 
-def _canonical(mesh: Surface, scale: float) -> tuple[NDArray[np.int64], _State]:
-    """Used nodes, sorted by place, and the mesh in that numbering: the order of the input is forgotten here."""
-    nodes = np.flatnonzero(mesh.used)
-    nodes = nodes[np.lexsort(mesh.position[nodes].T[::-1])]
+def _scale(mesh: Surface) -> float:
+    return mesh.diagonal or 1.0
+
+
+def _start(mesh: Surface, base: Selection, boundary: float, spread: float) -> tuple[NDArray[np.int64], _State]:
+    """Nodes of `base` sorted by place, and its mesh in that numbering: the order of the input is forgotten here."""
+    from crashkit.mesh import _contraction
+
+    order = np.lexsort(mesh.position[base.kept].T[::-1])
+    nodes = base.kept[order]
     new = np.full(mesh.n_nodes, -1, np.int32)
     new[nodes] = np.arange(len(nodes), dtype=np.int32)
-    faces = new[mesh.triangles]
-    # Corners turn until the lowest is first, faces are sorted: sums over them come in one order.
+    faces = new[base.faces]
+    # Corners turn until the lowest is first, and faces are sorted, so that sums over them come in one order.
     turn = faces.argmin(axis=1)
     faces = faces[np.arange(len(faces))[:, None], (turn[:, None] + np.arange(3)) % 3]
-    order = np.lexsort((mesh.part, faces[:, 2], faces[:, 1], faces[:, 0]))
+    sorted_faces = np.lexsort((base.part, faces[:, 2], faces[:, 1], faces[:, 0]))
+    faces = np.ascontiguousarray(faces[sorted_faces])
+    edges = unique_pairs(new[base.edges])
     at = mesh.position[nodes]
-    at = (at - (at.max(axis=0) + at.min(axis=0)) / 2) / scale
+    at = (at - (at.max(axis=0) + at.min(axis=0)) / 2) / _scale(mesh)
     state = _State(
         at=at,
-        quadric=np.empty((0, 10)),
-        faces=np.ascontiguousarray(faces[order]),
-        part=mesh.part[order],
-        edges=unique_pairs(new[mesh.edges]),
-        parts=mesh.node_parts[nodes],
+        quadric=_contraction.quadrics(at, faces, edges, *_faces_of_edges(faces, edges), boundary, spread),
+        faces=faces,
+        part=base.part[sorted_faces],
+        edges=edges,
+        parts=base.parts[order],
         # Equal costs are decided by a fixed shuffle of the places, so that flat regions thin out evenly.
         tie=np.random.default_rng(0).permutation(len(nodes)),
     )
@@ -127,7 +170,7 @@ def _canonical(mesh: Surface, scale: float) -> tuple[NDArray[np.int64], _State]:
 
 def _faces_of_edges(faces: NDArray[np.int32], edges: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """How many faces each edge has, and one of them (-1 where none)."""
-    width = int(max(faces.max(), edges.max(initial=0))) + 1
+    width = int(max(faces.max(initial=0), edges.max(initial=0))) + 1
     sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).astype(np.int64)
     side_keys = sides[:, 0] * width + sides[:, 1]
     keys = edges[:, 0].astype(np.int64) * width + edges[:, 1]
@@ -139,37 +182,98 @@ def _faces_of_edges(faces: NDArray[np.int32], edges: NDArray[np.int32]) -> tuple
     return (high - low).astype(np.int32), face
 
 
-def _contract_to(
-    state: _State, count: int, pair_distance: float, flip: float
+def _contract(
+    state: _State, count: int, pair_distance: float, locked: NDArray[np.bool_] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """Contract towards `count` vertices; `state` becomes the smaller mesh.
+    """Contract to `count` vertices, never the locked ones; `state` becomes the smaller mesh.
 
+    First only p -> q where q lies on all parts of p, so that borders between parts keep their course; where that
+    leads no further, across shared nodes. Vertices without any edge may go into the nearest one of their part.
     Returns the vertices kept, as numbers before, and where every vertex went, as numbers after.
     """
+    n = len(state.at)
+    kept, into = np.arange(n), np.arange(n, dtype=np.int32)
+    locked = np.zeros(n, bool) if locked is None else locked
+    join_parts = False
+    while len(kept) > count:
+        # Halving again and again renews the close pairs while the mesh grows coarser.
+        step_kept, step_into = _contract_once(state, max(count, len(kept) // 2), pair_distance, locked, join_parts)
+        if len(step_kept) == len(kept):
+            if join_parts:
+                raise MeshError(
+                    f"{count} nodes were asked for, but {len(kept)} parts or groups of parts have no node in common "
+                    "and each must keep one; ask for more nodes"
+                )
+            join_parts = True
+        kept, into, locked = kept[step_kept], step_into[into], locked[step_kept]
+    return kept, into
+
+
+def _contract_once(
+    state: _State, count: int, pair_distance: float, locked: NDArray[np.bool_], join_parts: bool
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     from crashkit.mesh import _contraction
 
-    pairs = _lone_vertices(state)
-    edges = np.concatenate([state.edges, pairs])
+    pairs = np.concatenate([_lone_vertices(state), _close_pairs(state, pair_distance)])
+    edges = np.concatenate([state.edges, unique_pairs(pairs)])
     is_pair = np.arange(len(edges)) >= len(state.edges)
     into, face_lives, edge_lives = _contraction.contract(
         state.at, state.quadric, state.faces, state.part, edges, is_pair, state.parts, state.tie,
-        np.zeros(len(state.at), bool), count, state.join_parts, flip,
+        locked, count, join_parts, FLIP,
     )  # fmt: skip
     kept = np.flatnonzero(into == np.arange(len(into)))
     new = np.full(len(into), -1, np.int32)
     new[kept] = np.arange(len(kept))
-    state.at, state.quadric, state.parts, state.tie = (
-        a[kept] for a in (state.at, state.quadric, state.parts, state.tie)
-    )
+    state.at, state.quadric = state.at[kept], state.quadric[kept]
+    state.parts, state.tie = state.parts[kept], state.tie[kept]
     state.faces, state.part = new[state.faces[face_lives]], state.part[face_lives]
     state.edges = unique_pairs(new[edges[edge_lives & ~is_pair]])
     return kept, new[into]
 
 
+def _relocate(
+    state: _State, kept: NDArray[np.int64], into: NDArray[np.int32], finer_at: NDArray[np.float64],
+    finer_parts: NDArray[np.uint64], finer_edges: NDArray[np.int32], weight: NDArray[np.float64], n_parts: int,
+    curvature: float, sweeps: int,
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:  # fmt: skip
+    """Let the kept vertices change places with nodes of the finer level beside them, see `_relocation.relocate`."""
+    from crashkit.mesh import _relocation
+    from crashkit.mesh.probe import cells_of_nodes, coarse_cells
+
+    cells = coarse_cells(state.faces, state.part, state.edges, state.parts, n_parts)
+    cell_start, cell_list = cells_of_nodes(cells.nodes, len(kept))
+    graph, finer_graph = adjacency(len(kept), state.edges), adjacency(len(finer_at), finer_edges)
+    coarse = _relocation.Coarse(
+        at=state.at.copy(),
+        cells=cells.nodes,
+        cell_part=cells.part,
+        cell_start=cell_start,
+        cell_list=cell_list,
+        near_start=graph.indptr,
+        near_list=graph.indices,
+        member_start=np.concatenate([[0], np.cumsum(np.bincount(into, minlength=len(kept)))]),
+        member_list=np.argsort(into, kind="stable"),
+    )
+    finer = _relocation.Finer(
+        at=finer_at,
+        weight=weight,
+        parts=finer_parts,
+        kind=np.unique(finer_parts, axis=0, return_inverse=True)[1].ravel(),
+        into=into,
+        near_start=finer_graph.indptr,
+        near_list=finer_graph.indices,
+    )
+    chosen = kept.copy()
+    _relocation.relocate(finer, coarse, chosen, curvature, sweeps)
+    state.at = coarse.at
+    into = into.copy()
+    into[chosen] = np.arange(len(chosen))
+    return chosen, into
+
+
 def _lone_vertices(state: _State) -> NDArray[np.int32]:
     """Pairs of each vertex that has no edge left with the nearest other vertex of its parts."""
-    n = len(state.at)
-    alone = np.ones(n, bool)
+    alone = np.ones(len(state.at), bool)
     alone[state.edges] = False
     pairs = [np.empty((0, 2), np.int64)]
     for word, bit in np.argwhere(_bits(np.bitwise_or.reduce(state.parts[alone], axis=0))):
@@ -182,11 +286,44 @@ def _lone_vertices(state: _State) -> NDArray[np.int32]:
     return unique_pairs(np.concatenate(pairs))
 
 
+def _close_pairs(state: _State, distance: float) -> NDArray[np.int32]:
+    """Pairs of vertices of one part without a common edge that may contract.
+
+    They are closer than `distance` and than the edges around them, and belong together: at the very same place, or
+    at most a few times as far apart along the graph. So the walls of a tube join, and sheets that only lie close
+    (which may move apart) do not.
+    """
+    from crashkit.mesh import _contraction
+
+    if distance <= 0 or len(state.at) < 2:
+        return np.empty((0, 2), np.int32)
+    i, j = state.edges.T
+    length = np.linalg.norm(state.at[i] - state.at[j], axis=1)
+    n = len(state.at)
+    degree = np.bincount(i, minlength=n) + np.bincount(j, minlength=n)
+    around = (np.bincount(i, length, n) + np.bincount(j, length, n)) / np.maximum(degree, 1)
+    k = min(_NEIGHBOURS, n)
+    apart, other = cKDTree(state.at).query(state.at, k=k, distance_upper_bound=distance)
+    one = np.broadcast_to(np.arange(n)[:, None], other.shape)
+    found = np.isfinite(apart) & (one < other)
+    pairs = np.stack([one[found], other[found]], axis=1).astype(np.int32)
+    apart = apart[found]
+    reach = np.maximum(np.minimum(around[pairs[:, 0]], around[pairs[:, 1]]), _SAME_PLACE)
+    common = (state.parts[pairs[:, 0]] & state.parts[pairs[:, 1]]).any(axis=1)
+    graph = adjacency(n, state.edges)
+    beside = graph[pairs[:, 0]].multiply(graph[pairs[:, 1]]).sum(axis=1).A1 > 0 if len(pairs) else common
+    same_place = apart <= _SAME_PLACE
+    keep = common & (same_place | (~beside & (apart <= reach)))
+    pairs, apart, same_place = pairs[keep], apart[keep], same_place[keep]
+    along = _contraction.graph_distances(pairs, apart * _DETOUR, state.at, graph.indptr, graph.indices)
+    return pairs[same_place | ((along > apart * (1 + 1e-9)) & np.isfinite(along))]
+
+
 def _bits(words: NDArray[np.uint64]) -> NDArray[np.bool_]:
     return (words[:, None] >> np.arange(64, dtype=np.uint64) & np.uint64(1)).astype(bool)
 
 
-def _selection(mesh: Surface, nodes: NDArray[np.int64], state: _State, chain: NDArray[np.int32]) -> Selection:
+def _selection(nodes: NDArray[np.int64], state: _State, chain: NDArray[np.int32]) -> Selection:
     """The state with the node numbers of level 0."""
     order = np.argsort(nodes)
     return Selection(

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -23,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from crashkit.dataset import open_dataset
 from crashkit.errors import DataError, OutputError, ReadError
 from crashkit.mesh.levels import Hierarchy, Level
 from crashkit.mesh.lifting import LiftingError, LiftingMeter
@@ -45,10 +45,11 @@ def write_hierarchy(
     Raises DataError if the hierarchy is not one of this dataset's mesh, OutputError if `path` cannot be written.
     """
     path = Path(path)
-    with open_root(path) as dataset:
+    with open_dataset(path) as dataset:
         if dataset.sizes["node"] != hierarchy.n_nodes:
             raise DataError(
-                f"{path}: has {dataset.sizes['node']} nodes, the hierarchy was made for {hierarchy.n_nodes}; coarsen this dataset"
+                f"{path}: has {dataset.sizes['node']} nodes, but the hierarchy was made for a mesh of "
+                f"{hierarchy.n_nodes}; build it from this dataset"
             )
         about = {
             "settings": json.dumps(hierarchy.settings, default=_plain),
@@ -91,6 +92,7 @@ def read_hierarchy(path: str | Path) -> Hierarchy:
                     to_finer=_csr(group, "to_finer", n_finer, group.sizes["level_node"]),
                     to_full=_csr(group, "to_full", n_full, group.sizes["level_node"]),
                     distance=group["distance"].values.astype(np.float64),
+                    face_part=group["face_part"].values.astype(np.int32),
                 )
             except (KeyError, ValueError) as error:
                 raise ReadError(
@@ -158,11 +160,17 @@ def mesh_checksum(dataset: xr.Dataset) -> str:
 
 @dataclass(frozen=True)
 class MeshArrays:
-    """What a hierarchy is built from: position (n, 3) float64, m; face_nodes (m, 3 or 4), face_part (m,)."""
+    """The mesh of a dataset: what a hierarchy is built from, and the solver's numbers.
+
+    position (n, 3) float64, m; face_nodes (m, 3 or 4), -1 in the last corner of a triangle; face_part (m,) index into
+    part_id (parts,); node_id (n,)
+    """
 
     position: NDArray[np.float64]
     face_nodes: NDArray[np.integer]
     face_part: NDArray[np.integer]
+    node_id: NDArray[np.integer]
+    part_id: NDArray[np.integer]
 
 
 def open_mesh(path: Path) -> MeshArrays:
@@ -170,55 +178,48 @@ def open_mesh(path: Path) -> MeshArrays:
 
     Raises ReadError if the file is no dataset, DataError if it holds no mesh.
     """
-    with open_root(path) as dataset:
-        missing = [n for n in ("reference_position", "face_nodes", "displacement") if n not in dataset]
+    names = ("reference_position", "face_nodes", "face_part", "node_id", "part_id")
+    with open_dataset(path) as dataset:
+        missing = [name for name in names if name not in dataset]
         if missing:
             raise DataError(
-                f"{path}: has no {missing[0]}; a mesh hierarchy needs a crash dataset with faces, made by crashkit ingest"
+                f"{path}: has no {missing[0]}; a mesh hierarchy needs a crash dataset with faces, "
+                "made by crashkit ingest"
             )
         at = dataset["reference_position"]
-        if "sim" in at.dims:
-            at = at.isel(sim=0)
-        faces = dataset["face_nodes"].values
-        part = dataset["face_part"].values if "face_part" in dataset else np.zeros(len(faces), np.int32)
-        return MeshArrays(np.asarray(at.values, np.float64), faces, part)
+        at = at.isel(sim=0) if "sim" in at.dims else at
+        others = (dataset[name].values for name in names[1:])
+        return MeshArrays(np.asarray(at.values, np.float64), *others)
 
 
 @contextmanager
-def open_root(path: Path, group: str | None = None) -> Iterator[xr.Dataset]:
-    """The dataset (or one group of it) at `path`, closed afterwards."""
+def _open_group(path: Path, name: str) -> Iterator[xr.Dataset]:
+    """A group of the dataset at `path`; raises DataError if it is not there."""
     import xarray as xr
 
-    if not path.exists():
-        raise ReadError(f"{path}: not found; expected a dataset made by crashkit ingest (.zarr or .nc)")
     options: dict[str, Any] = {"engine": "zarr", "consolidated": False} if path.is_dir() else {"engine": "netcdf4"}
     try:
-        dataset = xr.open_dataset(path, group=group, **options)
-    except KeyError:
-        raise
-    except Exception as error:  # what a damaged file raises is up to the libraries below
-        text = " ".join(str(error).split()) or type(error).__name__
-        raise ReadError(f"{path}: cannot be opened as a crash dataset ({text[:200]})") from error
-    with dataset:
-        yield dataset
+        group = xr.open_dataset(path, group=name, chunks=None, **options)
+    except (OSError, KeyError, ValueError) as error:  # what a missing group raises depends on the library below
+        raise DataError(f"{path}: has no group /{name}; run crashkit coarsen {path} again") from error
+    with group:
+        yield group
 
 
 @contextmanager
 def _open_level(path: Path, index: int) -> Iterator[xr.Dataset]:
-    with open_root(path, f"hierarchy/level_{index}") as group:
+    with _open_group(path, f"hierarchy/level_{index}") as group:
         yield group
 
 
 def _about(path: Path) -> dict[str, Any]:
     """Attributes of /hierarchy, checked against the dataset around it; `nodes` is added."""
-    with open_root(path) as dataset:
+    with open_dataset(path) as dataset:
         try:
-            with open_root(path, "hierarchy") as group:
+            with _open_group(path, "hierarchy") as group:
                 about = dict(group.attrs)
-        except (ReadError, KeyError, OSError):
-            about = {}
-        if "levels" not in about:
-            raise DataError(f"{path}: has no mesh hierarchy; run crashkit coarsen {path} first")
+        except DataError as error:
+            raise DataError(f"{path}: has no mesh hierarchy; run crashkit coarsen {path} first") from error
         if about["mesh_checksum"] != mesh_checksum(dataset):
             raise DataError(f"{path}: its mesh hierarchy belongs to another mesh; run crashkit coarsen {path} again")
         runs = [str(s) for s in dataset["sim"].values]
@@ -393,7 +394,7 @@ def _target(path: Path) -> Iterator[_Target]:
                 yield target
             finally:
                 target.close()
-            os.replace(beside, path)
+            beside.replace(path)
     finally:
         _remove(beside)
 

@@ -78,7 +78,8 @@ def surface(
         )
     if corners.max() >= len(at) or corners[:, :3].min() < 0 or corners.min() < -1:
         raise MeshError(
-            f"faces name nodes {corners.min()} to {corners.max()}; expected 0 to {len(at) - 1} (-1 only in a fourth corner)"
+            f"faces name nodes {corners.min()} to {corners.max()}; "
+            f"expected 0 to {len(at) - 1} (-1 only in a fourth corner)"
         )
     if not np.isfinite(at).all():
         node = int(np.argmin(np.isfinite(at).all(axis=1)))
@@ -118,7 +119,8 @@ def unique_pairs(pairs: NDArray[np.integer]) -> NDArray[np.int32]:
     low, high = pairs.min(axis=1).astype(np.int64), pairs.max(axis=1).astype(np.int64)
     low, high = low[low != high], high[low != high]
     width = int(high.max(initial=0)) + 1
-    keys = np.unique(low * width + high)
+    keys = np.sort(low * width + high)
+    keys = keys[np.diff(keys, prepend=-1) > 0]  # np.unique hashes, which is slower here
     return np.stack([keys // width, keys % width], axis=1).astype(np.int32)
 
 
@@ -131,7 +133,7 @@ def part_sets(n: int, triangles: NDArray[np.int32], part: NDArray[np.int32], n_p
     return sets
 
 
-def adjacency(n: int, edges: NDArray[np.int32]) -> sparse.csr_matrix:
+def adjacency(n: int, edges: NDArray[np.integer]) -> sparse.csr_matrix:
     """Symmetric 0/1 matrix (n, n) of undirected edges (e, 2)."""
     i, j = edges.T
     ones = np.ones(2 * len(edges))
@@ -164,9 +166,10 @@ def _without_useless(triangles: NDArray, part: NDArray) -> tuple[NDArray[np.int3
     a, b, c = triangles.T
     keep = (a != b) & (b != c) & (a != c)
     triangles, part = triangles[keep], part[keep]
-    keys = np.column_stack([np.sort(triangles, axis=1), part])
-    _, first = np.unique(keys, axis=0, return_index=True)
-    first.sort()
+    low, middle, high = np.sort(triangles, axis=1).T
+    order = np.lexsort((np.arange(len(part)), part, high, middle, low))
+    keys = np.stack([low, middle, high, part])[:, order]
+    first = np.sort(order[np.r_[True, (np.diff(keys, axis=1) != 0).any(axis=0)]]) if len(order) else order
     return triangles[first], part[first]
 
 

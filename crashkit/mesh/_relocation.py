@@ -1,0 +1,210 @@
+"""Compiled local search: kept vertices move to neighbouring nodes where that makes the level lift better."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from crashkit.mesh._closest import closest_weights
+
+
+class Coarse(NamedTuple):
+    """The coarse mesh: lists `x_list[x_start[v]:x_start[v + 1]]` of its vertices v.
+
+    at (k, 3); cells (c, 3), padded with -1, and their part; cells at each vertex; its graph neighbours; the finer
+    nodes that were contracted into it.
+    """
+
+    at: NDArray
+    cells: NDArray
+    cell_part: NDArray
+    cell_start: NDArray
+    cell_list: NDArray
+    near_start: NDArray
+    near_list: NDArray
+    member_start: NDArray
+    member_list: NDArray
+
+
+class Finer(NamedTuple):
+    """The nodes of the finer level.
+
+    at (n, 3); weight (n,): nodes of level 0 each stands for; parts (n, words) bit sets and kind (n,), equal where they
+    are; into (n,): coarse vertex each belongs to; graph neighbours.
+    """
+
+    at: NDArray
+    weight: NDArray
+    parts: NDArray
+    kind: NDArray
+    into: NDArray
+    near_start: NDArray
+    near_list: NDArray
+
+
+@njit(cache=True)
+def _at_least(points: NDArray, x: int, at: NDArray, cells: NDArray, c: int) -> float:
+    """Squared distance of x to the box around cell c: cheap, and never more than that to the cell."""
+    total = 0.0
+    for k in range(3):
+        low = high = at[cells[c, 0], k]
+        for corner in range(1, 3):
+            v = cells[c, corner]
+            if v >= 0:
+                low = min(low, at[v, k])
+                high = max(high, at[v, k])
+        gap = max(low - points[x, k], points[x, k] - high)
+        if gap > 0.0:
+            total += gap * gap
+    return total
+
+
+@njit(cache=True)
+def _closer(
+    points: NDArray, parts: NDArray, x: int, at: NDArray, cells: NDArray, cell_part: NDArray, c: int, best: float,
+    radius: float,
+) -> tuple[float, float]:  # fmt: skip
+    """Squared distance of x to cell c and what lifting may cost there; inf unless closer than `best` and of its part.
+
+    With p the closest point and s = sum_i w_i |x_i - p|^2, a field u is lifted to x with an error of at most
+    max|grad u| |x - p| + max|hess u| s / 2. The cost is this for a field that turns over on the length `radius`;
+    for s beyond radius^2 it grows with the root of s, since no field moves more than its own amplitude.
+    """
+    part = cell_part[c]
+    if (parts[x, part // 64] >> np.uint64(part % 64)) & np.uint64(1) == np.uint64(0):
+        return np.inf, np.inf
+    if _at_least(points, x, at, cells, c) >= best:
+        return np.inf, np.inf
+    w0, w1, w2, d2 = closest_weights(points, x, at, cells, c)
+    if d2 >= best:
+        return np.inf, np.inf
+    s = -d2
+    for k in range(3):
+        s += w0 * (at[cells[c, 0], k] - points[x, k]) ** 2
+        if w1 > 0.0:
+            s += w1 * (at[cells[c, 1], k] - points[x, k]) ** 2
+        if w2 > 0.0:
+            s += w2 * (at[cells[c, 2], k] - points[x, k]) ** 2
+    s = max(s, 0.0)
+    return d2, np.sqrt(d2) + s / (2.0 * radius + np.sqrt(s))
+
+
+@njit(cache=True)
+def _touches(cells: NDArray, c: int, v: int) -> bool:
+    return cells[c, 0] == v or cells[c, 1] == v or cells[c, 2] == v
+
+
+@njit(cache=True)
+def _closest_around(x: int, avoid: int, finer: Finer, coarse: Coarse, radius: float) -> tuple[int, float, float]:
+    """Closest cell around the vertex of x, none of those at vertex `avoid`: cell, squared distance, cost."""
+    best, best_d2, best_cost = -1, np.inf, np.inf
+    own = finer.into[x]
+    for k in range(coarse.near_start[own] - 1, coarse.near_start[own + 1]):
+        v = own if k < coarse.near_start[own] else coarse.near_list[k]
+        if v == avoid:
+            continue
+        for j in range(coarse.cell_start[v], coarse.cell_start[v + 1]):
+            c = coarse.cell_list[j]
+            if avoid >= 0 and _touches(coarse.cells, c, avoid):
+                continue
+            d2, cost = _closer(finer.at, finer.parts, x, coarse.at, coarse.cells, coarse.cell_part, c, best_d2, radius)
+            if d2 < best_d2:
+                best, best_d2, best_cost = c, d2, cost
+    return best, best_d2, best_cost
+
+
+@njit(cache=True)
+def _region(p: int, coarse: Coarse) -> NDArray:
+    """The finer nodes that belong to p and its neighbours."""
+    size = coarse.member_start[p + 1] - coarse.member_start[p]
+    for j in range(coarse.near_start[p], coarse.near_start[p + 1]):
+        v = coarse.near_list[j]
+        size += coarse.member_start[v + 1] - coarse.member_start[v]
+    out = np.empty(size, np.int64)
+    size = 0
+    for j in range(coarse.near_start[p] - 1, coarse.near_start[p + 1]):
+        v = p if j < coarse.near_start[p] else coarse.near_list[j]
+        for i in range(coarse.member_start[v], coarse.member_start[v + 1]):
+            out[size] = coarse.member_list[i]
+            size += 1
+    return out
+
+
+@njit(cache=True)
+def _stirred(p: int, sweep: int, last_move: NDArray, coarse: Coarse) -> bool:
+    """Whether p or a neighbour moved since the sweep before; where nothing did, nothing better can be found now."""
+    if last_move[p] >= sweep:
+        return True
+    for j in range(coarse.near_start[p], coarse.near_start[p + 1]):  # noqa: SIM110 - numba has no generators here
+        if last_move[coarse.near_list[j]] >= sweep:
+            return True
+    return False
+
+
+@njit(cache=True)
+def relocate(finer: Finer, coarse: Coarse, chosen: NDArray, radius: float, sweeps: int) -> int:
+    """Move each coarse vertex to the finer node beside it that most lowers the summed lifting cost around it.
+
+    chosen (k,): finer node of each coarse vertex; it and `coarse.at` are changed in place. A vertex only goes to nodes
+    of the same parts that no other vertex sits on. Returns the number of moves.
+    """
+    points, parts, at, cells, cell_part = finer.at, finer.parts, coarse.at, coarse.cells, coarse.cell_part
+    taken = np.zeros(len(finer.at), np.bool_)
+    taken[chosen] = True
+    cell = np.empty(len(finer.at), np.int64)
+    d2, cost = np.empty(len(finer.at)), np.empty(len(finer.at))
+    for x in range(len(finer.at)):
+        cell[x], d2[x], cost[x] = _closest_around(x, -1, finer, coarse, radius)
+    last_move = np.zeros(len(chosen), np.int64)
+    moves = 0
+    for sweep in range(sweeps):
+        moves_before = moves
+        for p in range(len(chosen)):
+            if not _stirred(p, sweep, last_move, coarse):
+                continue
+            region = _region(p, coarse)
+            # Without p's own cells first: they are what moves.
+            for x in region:
+                if cell[x] >= 0 and _touches(coarse.cells, cell[x], p):
+                    cell[x], d2[x], cost[x] = _closest_around(x, p, finer, coarse, radius)
+            here = chosen[p]
+            best, best_total = here, np.inf
+            for j in range(finer.near_start[here] - 1, finer.near_start[here + 1]):
+                candidate = here if j < finer.near_start[here] else finer.near_list[j]
+                if candidate != here and (taken[candidate] or finer.kind[candidate] != finer.kind[here]):
+                    continue
+                for k in range(3):
+                    at[p, k] = finer.at[candidate, k]
+                total = 0.0
+                for x in region:
+                    x_d2, x_cost = d2[x], cost[x]
+                    for n in range(coarse.cell_start[p], coarse.cell_start[p + 1]):
+                        c_d2, c_cost = _closer(
+                            points, parts, x, at, cells, cell_part, coarse.cell_list[n], x_d2, radius
+                        )
+                        if c_d2 < x_d2:
+                            x_d2, x_cost = c_d2, c_cost
+                    total += finer.weight[x] * x_cost
+                    if total >= best_total:
+                        break
+                # Less by a hair is rounding; moving for it would make the result depend on it.
+                if total < best_total * (1.0 - 1e-9):
+                    best, best_total = candidate, total
+            for k in range(3):
+                at[p, k] = finer.at[best, k]
+            for x in region:
+                for n in range(coarse.cell_start[p], coarse.cell_start[p + 1]):
+                    c_d2, c_cost = _closer(points, parts, x, at, cells, cell_part, coarse.cell_list[n], d2[x], radius)
+                    if c_d2 < d2[x]:
+                        cell[x], d2[x], cost[x] = coarse.cell_list[n], c_d2, c_cost
+            if best != here:
+                taken[here], taken[best] = False, True
+                chosen[p] = best
+                last_move[p] = sweep + 1
+                moves += 1
+        if moves == moves_before:
+            break
+    return moves
