@@ -44,7 +44,7 @@ _TRIANGLE, _QUAD, _POLYGON, _LINE, _POLYLINE, _VERTEX, _POLYVERTEX = 5, 9, 7, 3,
 _NODE_IDS = ("node_id", "node_ids", "globalnodeid", "globalids", "global_ids")
 _ELEMENT_IDS = ("element_id", "element_ids", "globalelementid", "globalids", "global_ids", "face_id")
 _PARTS = ("part_id", "part_ids", "part", "material_id", "materialids", "materialid", "objectid")
-_ALIVE = ("erosion_status", "alive")
+_ALIVE = ("erosion_status", "alive", "status")
 _NO_FIELDS = {*_NODE_IDS, *_ELEMENT_IDS, *_PARTS, *_ALIVE, "vtkghosttype", "vtkoriginalpointids", "vtkoriginalcellids"}
 # A displacement beside moving points may differ from their movement by rounding only.
 _AGREE = 1e-4
@@ -115,6 +115,52 @@ class GridSource(ABC):
         """Let go of files."""
 
 
+class WholeStates(GridSource):
+    """States whose mesh and arrays are read at once by `read`; the first and the last one read are kept."""
+
+    _first: Grid | None = None
+    _kept: tuple[int, Grid] | None = None
+
+    @abstractmethod
+    def read(self, state: int) -> Grid: ...
+
+    def first(self) -> Grid:
+        if self._first is None:
+            self._first = self.read(0)
+            self._first.check(self.place(0))
+        return self._first
+
+    def _state(self, state: int) -> Grid:
+        if self._kept is None or self._kept[0] != state:
+            grid, first = self.read(state), self.first()
+            grid.check(self.place(state))
+            parts = ("types", "offsets", "connectivity")
+            same = len(grid.points) == len(first.points)
+            if not same or not all(np.array_equal(getattr(grid, part), getattr(first, part)) for part in parts):
+                raise ReadError(
+                    f"{self.place(state)}: holds {len(grid.points)} points and {len(grid.types)} cells, the first state "
+                    f"{len(first.points)} and {len(first.types)}, or joins them otherwise; "
+                    "the mesh changed during the run, which is not supported"
+                )
+            self._kept = (state, grid)
+        return self._kept[1]
+
+    def points(self, state: int) -> NDArray[np.floating]:
+        return self._state(state).points
+
+    def array(self, kind: Place, name: str, state: int) -> NDArray[Any]:
+        grid, first = self._state(state), self.first()
+        found = (grid.point_data if kind == "point" else grid.cell_data).get(name)
+        expected = (first.point_data if kind == "point" else first.cell_data)[name].shape
+        if found is None or found.shape != expected:
+            what = "missing" if found is None else f"there with shape {found.shape}, expected {expected}"
+            raise ReadError(f"{self.place(state)}: the {kind} array {name!r} of the first state is {what}")
+        return found
+
+    def close(self) -> None:
+        self._kept = None
+
+
 class GridRun(Run):
     """A run whose states are meshes with arrays."""
 
@@ -131,7 +177,7 @@ class GridRun(Run):
         self.mesh = self._read_mesh(grid, reference)
         self._arrays, self.fields = self._offered(grid)
         self.parameters: Mapping[str, Parameter] = {}
-        self._life = _find(grid.cell_data, _ALIVE)
+        self._life = _find(grid.cell_data, _ALIVE, everywhere=False)
         unit = grid.units.get(self._reading.array or "", "")
         self.units = "SI" if unit == "m" else None
         self.problems = (*problems, *time_problems(self.time, [source.place(k) for k in range(len(self.time))]))
@@ -329,8 +375,9 @@ def _sort_cells(grid: Grid, place: str) -> tuple[_Group, _Group]:
     )
 
 
-def _find(arrays: Mapping[str, NDArray[Any]], names: tuple[str, ...]) -> str | None:
-    lower = {n.lower(): n for n, v in arrays.items() if v.ndim == 1 and np.isfinite(v).all()}
+def _find(arrays: Mapping[str, NDArray[Any]], names: tuple[str, ...], everywhere: bool = True) -> str | None:
+    """The first of `names` among the scalar arrays; `everywhere`: it must have a value for all."""
+    lower = {n.lower(): n for n, v in arrays.items() if v.ndim == 1 and (not everywhere or np.isfinite(v).all())}
     return next((lower[n] for n in names if n in lower), None)
 
 

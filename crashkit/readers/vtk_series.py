@@ -26,7 +26,7 @@ from crashkit.errors import CrashkitError, ReadError
 from crashkit.readers import register
 from crashkit.readers._checks import require_options
 from crashkit.readers._folders import runs_in
-from crashkit.readers._grid import Grid, GridRun, GridSource, Place
+from crashkit.readers._grid import Grid, GridRun, WholeStates
 from crashkit.readers._vtk_legacy import is_legacy, legacy_field_data, read_legacy
 from crashkit.readers._vtk_process import read_xml
 from crashkit.readers.base import Run, Runs
@@ -182,61 +182,22 @@ def _solver(source: FileSeries) -> str:
     return "OpenRadioss" if {"EROSION_STATUS", "ELEMENT_ID", "PART_ID"} <= names else "unknown"
 
 
-class FileSeries(GridSource):
-    """States in files of their own; the last one read is kept."""
+class FileSeries(WholeStates):
+    """States in files of their own, or in several files that are pieces of one mesh."""
 
     def __init__(self, states: Sequence[tuple[float, tuple[Path, ...]]], index: Path | None = None) -> None:
         self.time = np.array([time for time, _ in states], np.float64)
         self._states = [files for _, files in states]
         self.files = (*(() if index is None else (index,)), *(f for files in self._states for f in files))
-        self._kept: tuple[int, Grid] | None = None
-        self._first: Grid | None = None
 
     def place(self, state: int) -> str:
         return f"{self._states[state][0]}, state {state}"
 
-    def first(self) -> Grid:
-        if self._first is None:
-            self._first = self._read(0)
-        return self._first
-
-    def _read(self, state: int) -> Grid:
+    def read(self, state: int) -> Grid:
         pieces = [read_legacy(f) if is_legacy(f) else read_xml(f) for f in self._states[state]]
         for file, grid in zip(self._states[state], pieces, strict=True):
             grid.check(file)
         return pieces[0] if len(pieces) == 1 else _joined(pieces)
-
-    def _grid(self, state: int) -> Grid:
-        if self._kept is None or self._kept[0] != state:
-            grid, first = self._read(state), self.first()
-            same = all(
-                np.array_equal(getattr(grid, part), getattr(first, part))
-                for part in ("types", "offsets", "connectivity")
-            )
-            if len(grid.points) != len(first.points) or not same:
-                raise ReadError(
-                    f"{self.place(state)}: holds {len(grid.points)} points and {len(grid.types)} cells, the first state "
-                    f"{len(first.points)} and {len(first.types)}, or joins them otherwise; "
-                    "the mesh changed during the run, which is not supported"
-                )
-            self._kept = (state, grid)
-        return self._kept[1]
-
-    def points(self, state: int) -> NDArray[np.floating]:
-        return self._grid(state).points
-
-    def array(self, kind: Place, name: str, state: int) -> NDArray[Any]:
-        grid = self._grid(state)
-        arrays = grid.point_data if kind == "point" else grid.cell_data
-        expected = (self.first().point_data if kind == "point" else self.first().cell_data)[name].shape
-        found = arrays.get(name)
-        if found is None or found.shape != expected:
-            what = "missing" if found is None else f"there with shape {found.shape}, expected {expected}"
-            raise ReadError(f"{self.place(state)}: the {kind} array {name!r} of the first state is {what}")
-        return found
-
-    def close(self) -> None:
-        self._kept = None
 
 
 def _joined(pieces: Sequence[Grid]) -> Grid:

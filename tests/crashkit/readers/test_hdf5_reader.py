@@ -1,0 +1,163 @@
+"""The HDF5 layout of the public kart data: what is read is what stands in the file, and what cannot be is named."""
+
+from __future__ import annotations
+
+import shutil
+from importlib.resources import files
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import pyvista as pv
+
+from crashkit.errors import ReadError
+from crashkit.readers import reader_for
+from crashkit.readers.base import Parameter
+
+DEMO = Path(str(files("crashkit") / "data" / "kart_demo.h5"))
+
+
+@pytest.fixture
+def campaign(tmp_path, sample):
+    """A writable file in the layout, two runs of the sample."""
+    path = tmp_path / "runs.h5"
+    with h5py.File(path, "w") as file:
+        file["kart/displacements"] = np.stack([sample.displacement, 2 * sample.displacement])
+        file["kart/displacements"].attrs["units"] = "m"
+        file["kart/reference_configuration"] = np.stack([sample.points] * 2)
+        file["kart/faces"] = sample.faces
+        file["time"] = sample.time
+        file["parameter"] = np.array([[10.0, 5.0, 300.0], [20.0, -5.0, 400.0]])
+    return path
+
+
+def read(path: Path, **options):
+    return list(reader_for(path).runs(path, **options))
+
+
+def test_the_embedded_campaign_is_read_as_it_stands():
+    runs = read(DEMO)
+    with h5py.File(DEMO) as file:
+        assert [r.name for r in runs[:2]] == ["run_000", "run_001"]
+        assert len(runs) == 36
+        run = runs[7]
+        np.testing.assert_array_equal(run.displacement(2, 5), file["kart/displacements"][7, 2:5])
+        np.testing.assert_array_equal(run.mesh.position, file["kart/reference_configuration"][7].astype(float))
+        np.testing.assert_array_equal(run.mesh.face_nodes, file["kart/faces"][:])
+        np.testing.assert_array_equal(run.time, file["time"][:])
+        speed, angle, stress = file["parameter"][7]
+    assert run.parameters == {
+        "impact_speed": Parameter(speed, "m s-1"),
+        "impact_angle": Parameter(angle, "degree"),
+        "yield_stress": Parameter(stress, "MPa"),
+    }
+    assert run.units == "SI"
+    assert run.problems == ()
+
+
+def test_unnamed_parameters_of_the_kart_group_have_the_documented_names(campaign):
+    first, second = read(campaign)
+    assert first.parameters["impact_speed"] == Parameter(10.0, "m s-1")
+    assert second.parameters["yield_stress"] == Parameter(400.0, "MPa")
+
+
+def test_unnamed_parameters_of_another_group_are_left_out(campaign):
+    with h5py.File(campaign, "a") as file:
+        file.move("kart", "car")
+    assert read(campaign)[0].parameters == {}
+
+
+def test_without_units_in_the_file_the_user_must_say(campaign):
+    with h5py.File(campaign, "a") as file:
+        del file["kart/displacements"].attrs["units"]
+    assert read(campaign)[0].units is None
+
+
+def test_further_fields_are_found_by_their_shape(campaign, sample):
+    strain = np.random.default_rng(0).random((2, 3, len(sample.faces)), np.float32)
+    velocity = np.random.default_rng(1).random((2, 3, len(sample.points), 3), np.float32)
+    with h5py.File(campaign, "a") as file:
+        file["kart/plastic_strain"], file["kart/velocity"] = strain, velocity
+    run = read(campaign)[1]
+    assert (run.fields["plastic_strain"].location, run.fields["velocity"].quantity) == ("face", "velocity")
+    np.testing.assert_array_equal(run.field("plastic_strain", 1, 3), strain[1, 1:3])
+    np.testing.assert_array_equal(run.field("velocity", 0, 1), velocity[1, :1])
+
+
+@pytest.mark.parametrize("suffix", [".vtp", ".vtk", ".stl", ".obj"])
+def test_faces_come_from_a_mesh_file_beside_the_data(campaign, sample, tmp_path, suffix):
+    with h5py.File(campaign, "a") as file:
+        del file["kart/faces"]
+    mesh = tmp_path / f"mesh{suffix}"
+    # In millimetres and turned: only how the nodes are joined is taken from the file.
+    turned = (1000 * sample.points) @ np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]])
+    pv.PolyData.from_regular_faces(turned, sample.faces).save(mesh)
+    np.testing.assert_array_equal(read(campaign, mesh=mesh)[0].mesh.face_nodes, sample.faces)
+    assert mesh in read(campaign, mesh=mesh)[0].files
+
+
+def test_a_mesh_whose_nodes_stand_in_another_order_is_refused(campaign, sample, tmp_path):
+    with h5py.File(campaign, "a") as file:
+        del file["kart/faces"]
+    shuffled = sample.points[np.random.default_rng(0).permutation(len(sample.points))]
+    pv.PolyData.from_regular_faces(shuffled, sample.faces).save(tmp_path / "mesh.vtp")
+    with pytest.raises(ReadError, match="nodes stand in another order"):
+        read(campaign, mesh=tmp_path / "mesh.vtp")
+
+
+def test_missing_faces_are_asked_for(campaign):
+    with h5py.File(campaign, "a") as file:
+        del file["kart/faces"]
+    with pytest.raises(ReadError, match=r"no dataset kart/faces.*--mesh FILE"):
+        read(campaign)
+
+
+@pytest.mark.parametrize(
+    ("dataset", "value", "message"),
+    [
+        ("kart/reference_configuration", np.zeros((2, 5, 3)), r"shape \(2, 5, 3\), expected \(2, 162, 3\)"),
+        ("time", np.zeros(7), r"/time has shape \(7,\), expected \(3,\) or \(2, 3\)"),
+        ("kart/faces", np.full((4, 3), 162), r"face 0 names node 162; expected -1 to 161"),
+        ("kart/faces", np.zeros((4, 5), int), r"\(face, 3\) or \(face, 4\)"),
+        ("parameter", np.zeros((3, 3)), r"shape \(3, 3\), expected \(2, any\)"),
+    ],
+)
+def test_shapes_that_do_not_fit_are_named(campaign, dataset, value, message):
+    with h5py.File(campaign, "a") as file:
+        del file[dataset]
+        file[dataset] = value
+    with pytest.raises(ReadError, match=message):
+        read(campaign)
+
+
+def test_names_that_do_not_fit_the_columns_are_named(campaign):
+    with h5py.File(campaign, "a") as file:
+        file["parameter"].attrs["names"] = ["speed", "angle"]
+    with pytest.raises(ReadError, match="3 columns, 2 names"):
+        read(campaign)
+
+
+def test_a_value_that_is_not_finite_is_found_with_run_state_and_node(campaign):
+    with h5py.File(campaign, "a") as file:
+        file["kart/displacements"][1, 2, 17, 0] = np.nan
+    first, second = read(campaign)
+    first.displacement(0, 3)
+    with pytest.raises(ReadError, match="kart/displacements, run_001, state 2: .* of entry 17 is not a finite number"):
+        second.displacement(1, 3)
+
+
+def test_times_that_do_not_increase_are_a_problem(campaign):
+    with h5py.File(campaign, "a") as file:
+        file["time"][2] = file["time"][1]
+    assert "run_000, state 2: its time 0.015001 is not after" in read(campaign)[0].problems[0]
+
+
+@pytest.mark.parametrize("share", [0.001, 0.3, 0.999])
+def test_a_truncated_file_is_refused(tmp_path, share):
+    cut = tmp_path / "cut.h5"
+    shutil.copy(DEMO, cut)
+    with cut.open("r+b") as stream:
+        stream.truncate(int(share * DEMO.stat().st_size))
+    with pytest.raises(ReadError, match="cut.h5"):
+        list(reader_for(cut, "kart-hdf5").runs(cut))
