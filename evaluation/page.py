@@ -151,14 +151,19 @@ def plain(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int):
-        return f"{value:,}".replace(",", " ") if abs(value) >= 10000 else str(value)  # thin space
+        return _grouped(value, 10000)
     if isinstance(value, float):
-        if value == 0:
-            return "0"
-        if abs(value) >= 1000:
-            return f"{value:,.0f}".replace(",", " ")
-        return f"{value:.4f}".rstrip("0").rstrip(".") if abs(value) < 0.01 and abs(value) >= 1e-4 else f"{value:.3g}"
+        if value != 0 and abs(value) < 1e-4:
+            return f"{value:.2g}"
+        if abs(value) < 0.01:
+            return f"{value:.4f}".rstrip("0").rstrip(".") or "0"
+        return f"{value:.3g}" if abs(value) < 1000 else _grouped(round(value), 10000)
     return str(value)
+
+
+def _grouped(value: int, least: int) -> str:
+    """Digits in threes, apart by a thin space, from `least` on."""
+    return f"{value:,}".replace(",", "\u2009") if abs(value) >= least else str(value)
 
 
 def plain_json(value: Any) -> Any:

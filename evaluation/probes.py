@@ -243,13 +243,12 @@ def _iso_18571(time: Floats, truth: Floats, prediction: Floats) -> Rating:
     with np.errstate(invalid="ignore", divide="ignore"):  # a flat prediction correlates with nothing: no shift is found
         scores = ISO18571(np.column_stack([time, truth]), np.column_stack([time, prediction]), dt=RATING_STEP)
         unrounded = -1
-        return Rating(
-            overall=float(scores.overall_rating(unrounded)),
-            corridor=float(scores.corridor_rating(unrounded)),
-            phase=float(scores.phase_rating(unrounded)),
-            magnitude=float(scores.magnitude_rating(unrounded)),
-            slope=float(scores.slope_rating(unrounded)),
-        )
+        corridor = float(scores.corridor_rating(unrounded))
+        phase = float(scores.phase_rating(unrounded))
+        magnitude = float(scores.magnitude_rating(unrounded))
+        slope = float(scores.slope_rating(unrounded))
+    # As overall_rating of the package has it, which would compute the four a second time.
+    return Rating(0.4 * corridor + 0.2 * (phase + magnitude + slope), corridor, phase, magnitude, slope)
 
 
 def _times(time: ArrayLike, fewest: int) -> Floats:

@@ -20,12 +20,14 @@ def over_runs(
     workers: int = 1,
     scheduler: str | None = None,
     done: Callable[[int], None] | None = None,
+    patience: float = 10.0,
 ) -> list[Result]:
     """`job(run)` for every one of `runs`, in their order.
 
     workers    1 computes here; more start as many processes with one thread each
     scheduler  address of a Dask scheduler whose workers do it instead; they must see the same files
     done       called with the run number as each run is finished
+    patience   seconds after which a scheduler that does not answer is given up
 
     Raises what a job raised, at the first that fails; EvaluationError where Dask is wanted and missing or out of
     reach.
@@ -39,7 +41,7 @@ def over_runs(
             if done:
                 done(run)
         return results
-    return _with_dask(job, runs, min(workers, len(runs)), scheduler, done)
+    return _with_dask(job, runs, min(workers, len(runs)), scheduler, done, patience)
 
 
 def _with_dask(
@@ -48,6 +50,7 @@ def _with_dask(
     workers: int,
     scheduler: str | None,
     done: Callable[[int], None] | None,
+    patience: float,
 ) -> list[Result]:
     try:
         from distributed import Client, LocalCluster, as_completed
@@ -68,7 +71,7 @@ def _with_dask(
             client = stack.enter_context(Client(cluster))
         else:
             try:
-                client = stack.enter_context(Client(scheduler, timeout="10s"))
+                client = stack.enter_context(Client(scheduler, timeout=patience))
             except (OSError, ValueError) as error:
                 raise EvaluationError(
                     f"no Dask scheduler answers at {scheduler} ({error}); start one with `dask scheduler`, or use "

@@ -41,18 +41,20 @@ class ErrorMap:
         return columns
 
     def draw(self, sheet: Sheet) -> Figure:
-        from evaluation.pictures import ERROR
+        from evaluation.pictures import ERROR, PIXELS_PER_CM
         from evaluation.rendering import choose_view, render
 
         with look():
-            figure, axes = sheet.panels(len(self.errors), height=5.2, columns=min(2, len(self.errors)))
+            columns = min(2, len(self.errors))
+            figure, axes = sheet.panels(len(self.errors), height=5.2, columns=columns)
+        width = round(sheet.width * PIXELS_PER_CM / (1 if sheet.narrow else columns))
         view = choose_view([self.position], self.faces)
         top = max(float(np.nanmax(e)) for e in self.errors.values()) * CM
         for ax, (model, errors) in zip(axes, self.errors.items(), strict=True):
             worst = int(np.nanargmax(errors))
             picture = render(
-                self.position, self.faces, view, errors * CM, (0.0, top), ERROR, 760, marked=np.array([worst]),
-                marker_colour="#0072B2", marker_size=16,
+                self.position, self.faces, view, errors * CM, (0.0, top), ERROR, width, marked=np.array([worst]),
+                marker_colour="#0072B2", marker_size=max(4.0, 16 * width / 760),
             )  # fmt: skip
             ax.imshow(picture, interpolation="antialiased")
             ax.set_axis_off()

@@ -16,6 +16,7 @@ from evaluation.comparison import agree_on_split
 from evaluation.predictor import Model
 from evaluation.reference import Reference
 from evaluation.result import Evaluation, compare
+from evaluation.sensors import choose_sensors
 
 TRAIN, TEST = range(9), range(9, 12)
 
@@ -82,7 +83,8 @@ def models(reference: Reference, make_predictor: Callable[..., NearestPod]) -> t
 @pytest.fixture(scope="session")
 def evaluation(reference: Reference, models: tuple[Model, ...]) -> Evaluation:
     context = {"Dataset": "kart.zarr", "Machine": "a test"}
-    return compare(reference, models, agree_on_split(reference, models), context=context)
+    split, sensors = agree_on_split(reference, models), choose_sensors(reference, probes=[1, 900])
+    return compare(reference, models, split, context=context, sensors=sensors)
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,106 @@
+"""The data card: numbers of real runs, and runs that are not like the others."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from crashkit.errors import OutputError
+from evaluation.datacard import summarise, surprise, write_card
+from evaluation.figures.outliers import robust_score
+
+
+def test_the_card_is_complete(reference, tmp_path):
+    page = write_card(reference, tmp_path / "card", about={"Path": "kart.zarr"})
+    text = page.read_text(encoding="utf-8")
+    for name in ("envelopes", "coverage", "singular_values", "outliers"):
+        assert f'id="figure-{name}"' in text
+        assert (tmp_path / "card" / "figures" / f"{name}.csv").stat().st_size > 0
+    numbers = json.loads((tmp_path / "card" / "card.json").read_text(), parse_constant=pytest.fail)
+    assert numbers["runs"]["run"] == list(reference.runs)
+    assert numbers["singular_values_normalised"][0] == 1
+    assert "kart.zarr" in text
+
+
+def test_displacements_and_speeds_are_those_of_the_runs(reference):
+    found = summarise(reference, count=5)
+    u = reference.displacement(3).astype(float)
+    np.testing.assert_allclose(found.mean[3], np.linalg.norm(u, axis=-1).mean(axis=1))
+    np.testing.assert_allclose(found.largest[3], np.linalg.norm(u, axis=-1).max(axis=1))
+    steps = np.linalg.norm(np.diff(u, axis=0), axis=-1) / np.diff(reference.time)[:, None]
+    assert found.speed[3] == pytest.approx(steps.max())
+    assert not found.lost.any()
+
+
+def test_gone_nodes_are_counted_and_not_zero(eroded, reference):
+    found = summarise(eroded, count=5)
+    np.testing.assert_allclose(found.lost, 50 / reference.n_nodes)
+    u = reference.displacement(0)[-1, 50:].astype(float)
+    assert found.mean[0, -1] == pytest.approx(np.linalg.norm(u, axis=-1).mean())
+
+
+def test_leaving_a_run_out_is_what_refitting_without_it_gives():
+    rng = np.random.default_rng(0)
+    parameters = rng.uniform(-1, 1, (14, 1))
+    samples = rng.normal(size=(14, 2, 3, 3))
+    x = 2 * (parameters - parameters.min()) / np.ptp(parameters) - 1
+    basis = np.column_stack([np.ones(14), x, x**2])  # 14 runs carry three terms
+    for run in (0, 5, 13):
+        rest = np.arange(14) != run
+        fit, *_ = np.linalg.lstsq(basis[rest], samples[rest].reshape(13, -1), rcond=None)
+        expected = np.linalg.norm((samples[run].ravel() - basis[run] @ fit).reshape(2, 3, 3), axis=-1).mean()
+        assert surprise(parameters, samples)[run] == pytest.approx(expected)
+
+
+def test_a_run_with_wrong_parameters_stands_out():
+    rng = np.random.default_rng(1)
+    parameters = rng.uniform(-1, 1, (30, 2))
+    modes = rng.normal(size=(2, 3, 4, 3))
+    samples = np.einsum("rp,psnd->rsnd", parameters, modes) + 0.05 * rng.normal(size=(30, 3, 4, 3))
+    parameters[7] = [-0.5, 0.5] if parameters[7, 0] > 0 else [0.5, -0.5]
+    score = robust_score(surprise(parameters, samples))
+    assert int(np.argmax(score)) == 7
+    assert score[7] > 5
+
+
+def test_runs_that_are_all_alike_have_no_score():
+    assert robust_score(np.ones(5)).tolist() == [0] * 5
+
+
+def test_a_dataset_without_parameters_has_a_card(reference, tmp_path):
+    plain = replace(reference, parameters=np.empty((12, 0)), parameter_names=(), parameter_units=())
+    text = write_card(plain, tmp_path / "card").read_text(encoding="utf-8")
+    assert "figure-coverage" not in text
+    assert "figure-envelopes" in text
+
+
+def test_a_single_run_has_a_card(reference, tmp_path):
+    one = replace(reference, runs=("only",), parameters=reference.parameters[:1])
+    text = write_card(one, tmp_path / "card").read_text(encoding="utf-8")
+    assert "figure-outliers" not in text
+    assert "1 runs for 3 parameters" in text
+
+
+def test_an_earlier_card_is_replaced_and_anything_else_left_alone(reference, tmp_path):
+    few = replace(reference, runs=reference.runs[:2], parameters=reference.parameters[:2])
+    write_card(few, tmp_path / "card")
+    (tmp_path / "card" / "old.txt").write_text("x")
+    write_card(few, tmp_path / "card")
+    assert not (tmp_path / "card" / "old.txt").exists()
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("keep")
+    with pytest.raises(OutputError, match=r"exists and holds no card\.json"):
+        write_card(few, tmp_path / "mine")
+    assert (tmp_path / "mine" / "notes.txt").read_text() == "keep"
+
+
+def test_a_card_that_fails_leaves_nothing(reference, tmp_path):
+    def broken(run: int) -> np.ndarray:
+        raise OSError(5, "cannot be read", "run.bin")
+
+    with pytest.raises(OutputError):
+        write_card(replace(reference, displacement=broken), tmp_path / "card")
+    assert list(tmp_path.iterdir()) == []

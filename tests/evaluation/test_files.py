@@ -1,0 +1,100 @@
+"""ParaView files of an evaluation, read back with VTK: all states, truth, prediction, error, levels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import pyvista as pv
+
+from evaluation.files import coarsest_level, contributions, default_runs, file_name, lone_edges, write_run
+
+
+@pytest.fixture(scope="module")
+def written(evaluation, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("vtk")
+    return folder, write_run(evaluation, 9, folder)
+
+
+def test_each_model_and_each_coarse_mesh_has_both_formats(written):
+    folder, files = written
+    assert sorted(p.name for p in files) == sorted(
+        f"run_09_{name}.{suffix}"
+        for name in ("mh", "podnn", "gpr", "mh_level1", "mh_level2", "mh_level3")
+        for suffix in ("pvd", "vtkhdf")
+    )
+    assert all(p.parent == folder and p.exists() for p in files)
+
+
+def test_all_states_come_back_from_pvd(written, reference, models):
+    reader = pv.get_reader(str(written[0] / "run_09_mh.pvd"))
+    np.testing.assert_allclose(reader.time_values, reference.time)
+    finest = models[0].predictors[0].predict(reference.parameters[9], reference.time)
+    for state, time in enumerate(reader.time_values):
+        reader.set_active_time_value(time)
+        mesh = reader.read()[0]
+        np.testing.assert_array_equal(mesh["displacement"], reference.displacement(9)[state])
+        np.testing.assert_allclose(mesh["predicted"][reference.level(1).kept], finest[state], atol=1e-6)
+        np.testing.assert_allclose(mesh["error"], mesh["predicted"] - mesh["displacement"], atol=1e-7)
+        np.testing.assert_allclose(mesh["error_magnitude"], np.linalg.norm(mesh["error"], axis=1), rtol=1e-5)
+        parts = [mesh[f"contribution_{name}"] for name in ("MH3", "MH2", "MH1")]
+        np.testing.assert_allclose(sum(parts), mesh["predicted"], atol=1e-6)
+        assert np.unique(mesh["coarsest_level"]).tolist() == [0, 1, 2, 3]
+
+
+def test_all_states_come_back_from_vtkhdf(written, reference):
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkIOHDF import vtkHDFReader
+
+    reader = vtkHDFReader()
+    reader.SetFileName(str(written[0] / "run_09_podnn.vtkhdf"))
+    reader.UpdateInformation()
+    assert reader.GetNumberOfSteps() == len(reference.time)
+    for state in range(reader.GetNumberOfSteps()):
+        reader.SetStep(state)
+        reader.Update()
+        values = vtk_to_numpy(reader.GetOutputDataObject(0).GetPointData().GetArray("displacement"))
+        np.testing.assert_array_equal(values, reference.displacement(9)[state])
+
+
+def test_the_coarse_mesh_stands_alone(written, reference, models):
+    reader = pv.get_reader(str(written[0] / "run_09_mh_level2.pvd"))
+    reader.set_active_time_value(reader.time_values[-1])
+    mesh = reader.read()[0]
+    level = reference.level(2)
+    np.testing.assert_allclose(mesh.points, reference.position[level.kept], atol=1e-6)
+    np.testing.assert_array_equal(mesh["node_id"], reference.node_id[level.kept])
+    assert mesh.n_cells == len(level.faces) + len(lone_edges(level.faces, level.edges))
+    expected = models[0].predictors[1].predict(reference.parameters[9], reference.time)[-1]
+    np.testing.assert_allclose(mesh["predicted"], expected, atol=1e-6)
+
+
+def test_contributions_add_up_to_the_finest():
+    rng = np.random.default_rng(0)
+    lifted = {name: rng.normal(size=(2, 5, 3)) for name in ("MH3", "MH2", "MH1")}
+    parts = contributions(lifted)
+    np.testing.assert_array_equal(parts["MH3"], lifted["MH3"])
+    np.testing.assert_allclose(sum(parts.values()), lifted["MH1"])
+
+
+def test_lone_edges_are_those_of_no_face():
+    faces = np.array([[0, 1, 2]])
+    edges = np.array([[0, 1], [1, 2], [0, 2], [2, 3], [3, 4]])
+    assert lone_edges(faces, edges).tolist() == [[2, 3], [3, 4]]
+    assert lone_edges(faces, edges[:3]).shape == (0, 2)
+
+
+def test_levels_are_nested_in_the_marked_nodes(reference):
+    marked = coarsest_level(reference)
+    for level in reference.levels:
+        assert (marked >= level.index).sum() == level.n_nodes
+
+
+def test_the_worst_and_the_median_run_of_the_best_model_are_written(evaluation):
+    errors = evaluation.scores[evaluation.ranked[0].label].of_runs
+    order = np.argsort(errors)
+    assert default_runs(evaluation) == (9 + order[2], 9 + order[1])
+
+
+def test_names_become_file_names():
+    assert file_name("run 1/2 <x>_MH1") == "run-1-2-x-_MH1"
+    assert file_name("../..") == "run"

@@ -1,0 +1,110 @@
+"""The words follow from the numbers: change the numbers and the words change."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from evaluation.comparison import Split
+from evaluation.result import compare
+from evaluation.verdict import clearly_better, difference, statements
+
+
+def _with_errors(evaluation, **means):
+    """`evaluation` with other errors: model -> m for each of the three runs."""
+    scores = dict(evaluation.scores)
+    for model, values in means.items():
+        label = model.replace("_", "-")
+        e2 = np.broadcast_to(np.asarray(values)[None, :, None], scores[label].e2.shape)
+        scores[label] = replace(scores[label], e2=e2)
+    return replace(evaluation, scores=scores)
+
+
+def _said(evaluation, about):
+    return [s for s in statements(evaluation) if s.about == about]
+
+
+def test_the_most_accurate_model_is_the_one_with_the_lowest_error(evaluation):
+    low = _with_errors(evaluation, PODNN=[0.001, 0.001, 0.002])
+    (said,) = _said(low, "Highest accuracy")
+    assert said.text.startswith("PODNN: mean node error 0.13 cm")
+    assert "cannot be told apart" not in said.text
+
+
+def test_models_that_cannot_be_told_apart_are_named(evaluation):
+    near = _with_errors(
+        evaluation, PODNN=[0.010, 0.012, 0.011], POD_GPR=[0.012, 0.010, 0.0115], MH1=[1] * 3, MH2=[1] * 3, MH3=[1] * 3
+    )
+    (said,) = _said(near, "Highest accuracy")
+    assert "POD-GPR cannot be told apart" in said.text
+
+
+def test_a_multi_hierarchical_model_that_loses_is_named_as_the_loser(evaluation):
+    lost = _with_errors(
+        evaluation, MH1=[0.03, 0.04, 0.05], MH2=[0.04] * 3, MH3=[0.05] * 3, PODNN=[0.01] * 3, POD_GPR=[0.02] * 3
+    )
+    (said,) = _said(lost, "Multi-hierarchical against the best baseline")
+    assert said.kind == "warning"
+    assert "MH1, the best multi-hierarchical level, loses to PODNN: 4.00 cm against 1.00 cm" in said.text
+    assert "better on 0 of 3" in said.text
+
+
+def test_a_multi_hierarchical_model_that_wins_is_no_warning(evaluation):
+    won = _with_errors(evaluation, MH1=[0.01] * 3, MH2=[0.02] * 3, MH3=[0.03] * 3, PODNN=[0.05] * 3, POD_GPR=[0.06] * 3)
+    (said,) = _said(won, "Multi-hierarchical against the best baseline")
+    assert said.kind == "finding"
+    assert "MH1 beats PODNN" in said.text
+    (levels,) = _said(won, "Levels")
+    assert levels.kind == "finding"
+
+
+def test_a_finer_level_that_is_worse_is_a_warning(evaluation):
+    odd = _with_errors(evaluation, MH1=[0.03] * 3, MH2=[0.02] * 3, MH3=[0.04] * 3)
+    (said,) = _said(odd, "Levels")
+    assert said.kind == "warning"
+    assert "MH1 is not better than MH2" in said.text
+    assert "MH2 is not better" not in said.text
+
+
+def test_the_lightest_of_the_good_coarse_models_is_for_visualisation(evaluation):
+    good = _with_errors(evaluation, MH1=[0.010] * 3, MH2=[0.012] * 3, MH3=[0.03] * 3)
+    assert _said(good, "Visualisation on weak hardware")[0].text.startswith("MH2: 50 of 2400 nodes")
+
+
+def test_few_test_runs_and_single_seeds_are_warned_of(evaluation):
+    assert "There are 3 test runs" in _said(evaluation, "Few test runs")[0].text
+    assert _said(evaluation, "One seed each")
+
+
+def test_a_single_test_run_ranks_nobody(reference, models):
+    one = compare(reference, models, Split(tuple(range(9)), (9,)), timed=False)
+    (said,) = _said(one, "One test run")
+    assert said.kind == "warning"
+    assert "cannot be told apart" in _said(one, "Highest accuracy")[0].text
+    assert not _said(one, "Smallest worst case")
+
+
+def test_a_large_relative_error_is_called_out(evaluation):
+    assert "Relative displacement error" in _said(evaluation, "Large relative error")[0].text
+
+
+def test_the_interval_is_that_of_paired_differences():
+    rng = np.random.default_rng(0)
+    hard = rng.uniform(1, 9, 40)  # runs differ much more than models
+    mean, low, high = difference(hard + 0.1 + rng.normal(0, 0.02, 40), hard)
+    assert mean == pytest.approx(0.1, abs=0.02)
+    assert 0 < low < 0.1 < high < 0.2
+
+
+def test_one_run_says_nothing_about_a_difference():
+    assert difference(np.array([2.0]), np.array([1.0]))[1:] == (-np.inf, np.inf)
+
+
+def test_clearly_better_needs_more_than_a_lower_mean(evaluation):
+    mh1, podnn = evaluation.entries[0], evaluation.entries[3]
+    scattered = _with_errors(evaluation, MH1=[0.01, 0.05, 0.03], PODNN=[0.05, 0.02, 0.03])
+    assert scattered.scores["MH1"].mean < scattered.scores["PODNN"].mean
+    assert not clearly_better(scattered, mh1, podnn)
+    assert clearly_better(_with_errors(evaluation, MH1=[0.01] * 3, PODNN=[0.02, 0.03, 0.02]), mh1, podnn)
