@@ -142,6 +142,13 @@ class WholeStates(GridSource):
                     f"{len(first.points)} and {len(first.types)}, or joins them otherwise; "
                     "the mesh changed during the run, which is not supported"
                 )
+            missing = [n for n in first.point_data if n not in grid.point_data]
+            missing += [n for n in first.cell_data if n not in grid.cell_data]
+            if missing:
+                raise ReadError(
+                    f"{self.place(state)}: lacks the array {missing[0]!r} of the first state; it is cut short, or its "
+                    "output changed during the run, which is not supported"
+                )
             self._kept = (state, grid)
         return self._kept[1]
 
@@ -150,11 +157,10 @@ class WholeStates(GridSource):
 
     def array(self, kind: Place, name: str, state: int) -> NDArray[Any]:
         grid, first = self._state(state), self.first()
-        found = (grid.point_data if kind == "point" else grid.cell_data).get(name)
+        found = (grid.point_data if kind == "point" else grid.cell_data)[name]
         expected = (first.point_data if kind == "point" else first.cell_data)[name].shape
-        if found is None or found.shape != expected:
-            what = "missing" if found is None else f"there with shape {found.shape}, expected {expected}"
-            raise ReadError(f"{self.place(state)}: the {kind} array {name!r} of the first state is {what}")
+        if found.shape != expected:
+            raise ReadError(f"{self.place(state)}: {kind} array {name!r} has shape {found.shape}, expected {expected}")
         return found
 
     def close(self) -> None:

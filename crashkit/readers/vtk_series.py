@@ -69,20 +69,17 @@ def _found(path: Path) -> dict[str, Sequence[Path]]:
         if kind != "grid":
             return {}
         numbered = _numbered(path.parent)
-        return next(({name: files} for name, files in numbered.items() if path in files), {})
+        alone = path.resolve().parent.name if len(numbered) == 1 else None
+        return next(({alone or name: files} for name, files in numbered.items() if path in files), {})
     if not path.is_dir():
         return {}
-    here = _found_in(path)
-    if here:
-        return here
-    return runs_in(path, _found_in)
+    # A list of states names what stands in the folders beside it.
+    return _lists(path) or runs_in(path, lambda folder: _lists(folder) or dict(_numbered(folder)))
 
 
-def _found_in(folder: Path) -> dict[str, Sequence[Path]]:
+def _lists(folder: Path) -> dict[str, Sequence[Path]]:
     lists = [p for p in sorted(folder.iterdir()) if p.suffix in (".pvd", ".series") and _kind(p) in ("pvd", "series")]
-    if lists:
-        return {_stem(p): [p] for p in lists}
-    return dict(_numbered(folder))
+    return {_stem(p): [p] for p in lists}
 
 
 def _stem(file: Path) -> str:

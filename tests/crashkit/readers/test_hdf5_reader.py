@@ -143,7 +143,7 @@ def test_a_value_that_is_not_finite_is_found_with_run_state_and_node(campaign):
         file["kart/displacements"][1, 2, 17, 0] = np.nan
     first, second = read(campaign)
     first.displacement(0, 3)
-    with pytest.raises(ReadError, match="kart/displacements, run_001, state 2: .* of entry 17 is not a finite number"):
+    with pytest.raises(ReadError, match=r"kart/displacements, run_001, state 2: .* of entry 17 is not a finite number"):
         second.displacement(1, 3)
 
 
@@ -159,5 +159,5 @@ def test_a_truncated_file_is_refused(tmp_path, share):
     shutil.copy(DEMO, cut)
     with cut.open("r+b") as stream:
         stream.truncate(int(share * DEMO.stat().st_size))
-    with pytest.raises(ReadError, match="cut.h5"):
+    with pytest.raises(ReadError, match=r"cut\.h5"):
         list(reader_for(cut, "kart-hdf5").runs(cut))

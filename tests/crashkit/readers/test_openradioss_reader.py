@@ -165,7 +165,9 @@ def test_a_truncated_packed_file_is_refused_with_its_name(run_b, only_run, share
 def test_truncation_names_the_byte(plain, only_run):
     with (plain / "kartA001").open("r+b") as stream:
         stream.truncate(20_000)
-    with pytest.raises(ReadError, match="node positions at byte 323 should take 28860 bytes, but the file ends at byte 20000"):
+    with pytest.raises(
+        ReadError, match="node positions at byte 323 should take 28860 bytes, but the file ends at byte 20000"
+    ):
         only_run(plain)
 
 
@@ -174,7 +176,7 @@ def test_shells_that_change_during_the_run_are_refused(plain, only_run):
     content = bytearray(file.read_bytes())
     content[only_run(plain)._layout.kinds["shell"].nodes.offset + 3] ^= 1
     file.write_bytes(content)
-    with pytest.raises(ReadError, match="kartA002: the shells at byte .* join other nodes than in kartA001"):
+    with pytest.raises(ReadError, match=r"kartA002: the shells at byte .* join other nodes than in kartA001"):
         only_run(plain).displacement(0, 2)
 
 

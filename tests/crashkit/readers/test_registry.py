@@ -68,7 +68,9 @@ def test_a_wrong_suffix_does_not_mislead(data, sample, tmp_path):
     disguised = tmp_path / "mesh.vtu"
     shutil.copy(data("d3plot/beamip") / "d3plot", disguised)
     assert reader_for(disguised).name == "d3plot"
-    write_paraview(tmp_path / "run.vtkhdf", sample.points, sample.faces, sample.time, {"displacement": sample.displacement})
+    write_paraview(
+        tmp_path / "run.vtkhdf", sample.points, sample.faces, sample.time, {"displacement": sample.displacement}
+    )
     (tmp_path / "run.vtkhdf").rename(tmp_path / "run.h5")
     assert reader_for(tmp_path / "run.h5").name == "vtkhdf"
 
@@ -87,7 +89,7 @@ def test_a_missing_path_is_named(tmp_path):
 
 
 def test_an_unknown_reader_is_answered_with_the_known_ones(tmp_path):
-    with pytest.raises(CrashkitError, match="'nastran' is not known; known are .*d3plot"):
+    with pytest.raises(CrashkitError, match=r"'nastran' is not known; known are .*d3plot"):
         reader_for(tmp_path, "nastran")
 
 
