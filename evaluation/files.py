@@ -15,7 +15,7 @@ from crashkit.paraview import write_paraview
 from evaluation.predictor import Model, Predictor
 from evaluation.reference import Reference
 from evaluation.result import Evaluation
-from evaluation.scoring import full_field
+from evaluation.scoring import full_field, mesh_of
 
 # Bytes of one predicted field held at once; several of them are.
 _BUDGET = 64 << 20
@@ -152,7 +152,9 @@ def _write_full(reference: Reference, model: Model, run: int, truth: NDArray[np.
 def _write_coarse(
     reference: Reference, predictor: Predictor, run: int, truth: NDArray[np.float32], path: Path
 ) -> list[Path]:
-    level = reference.level(predictor.level)
+    level = mesh_of(reference, predictor)
+    if level is None:
+        return []
     own = truth[:, level.kept]
     data: dict[str, Any] = dict(_errors(own, predictor.predict(reference.parameters[run], reference.time)))
     data["node_id"] = reference.node_id[level.kept]

@@ -8,6 +8,23 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+
+
+class Mesh(Protocol):
+    """The coarse mesh a predictor works on; the fields mean what `crashkit.mesh.levels.Level` says."""
+
+    @property
+    def kept(self) -> NDArray[np.int64]: ...
+
+    @property
+    def faces(self) -> NDArray[np.int32]: ...
+
+    @property
+    def edges(self) -> NDArray[np.int32]: ...
+
+    @property
+    def to_full(self) -> sparse.csr_matrix: ...
 
 
 class Predictor(Protocol):
@@ -15,6 +32,7 @@ class Predictor(Protocol):
 
     name          "MH1", "PODNN", "POD-GPR r=12", ...
     level         the mesh level it predicts on; 0 is the full mesh
+    mesh          its coarse mesh where that is not the dataset's level, as after adaptive refinement; else None
     n_parameters  trained numbers, the budget shown beside the errors
     n_latent      numbers a state is reduced to (4 in the paper); the POD floor beside it has as many modes
     seconds_per_epoch, training_seconds  as recorded during training (NaN where it makes no sense)
@@ -23,6 +41,7 @@ class Predictor(Protocol):
 
     name: str
     level: int
+    mesh: Mesh | None
     n_parameters: int
     n_latent: int
     seconds_per_epoch: float

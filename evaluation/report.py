@@ -43,8 +43,8 @@ _TEXT = (
     "The relative error is the L2 norm of the displacement error over all nodes and states of a run, divided by "
     "that of "
     "the displacement, and averaged over the runs; it does not depend on where the origin lies. "
-    "The POD floor is the error of projecting the test runs themselves on the leading modes of all other runs: "
-    "no model that reduces linearly to as many numbers on the same modes can be better.",
+    "The POD floor is the error of projecting the test runs themselves on the leading modes of all other runs, not "
+    "centred: what a linear reduction to as many numbers costs before any regression.",
     "Milliseconds are medians over repetitions on the machine named below, for all states of a run asked in one call "
     "and divided by their number, unless a column says otherwise.",
 )

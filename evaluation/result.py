@@ -17,7 +17,7 @@ from evaluation.pod import Pod, StreamedPod
 from evaluation.predictor import Model, Predictor
 from evaluation.reference import Reference
 from evaluation.regions import by_grid, by_part
-from evaluation.scoring import Groups, Key, RunScores, Scores, full_field, gather, score_run
+from evaluation.scoring import Groups, Key, RunScores, Scores, full_field, gather, mesh_of, score_run
 from evaluation.sensors import Sensors, choose_sensors
 from evaluation.streaming import over_runs
 from evaluation.timing import Timing, time_predictions
@@ -78,6 +78,11 @@ class Evaluation:
     def lifting(self, level: int) -> float:
         """Mean error of lifting the truth itself from `level`, m; 0 on the full mesh."""
         return 0.0 if level == 0 else float(masked_mean(np.array([r.lifting[level] for r in self.runs])))
+
+    def nodes(self, entry: Entry) -> int:
+        """Number of nodes that `entry` predicts on."""
+        mesh = mesh_of(self.reference, self.predictor(entry))
+        return self.reference.n_nodes if mesh is None else len(mesh.kept)
 
     def lifted(self, entry: Entry, run: int, states: slice | Sequence[int] = slice(None)) -> NDArray[np.float32]:
         """Prediction of the first seed of `entry` for run number `run`, on the full mesh: (state, node, 3), m."""

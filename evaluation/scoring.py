@@ -27,7 +27,7 @@ from evaluation.measures import (
     relative_error,
 )
 from evaluation.pod import held, projection_error
-from evaluation.predictor import Predictor
+from evaluation.predictor import Mesh, Predictor
 from evaluation.reference import Reference
 from evaluation.sensors import Parted, Sensors, Watched, part_error, watch
 
@@ -142,7 +142,8 @@ def _score(
     groups: Groups,
     sensors: Sensors | None,
 ) -> RunScore:
-    own = truth if predictor.level == 0 else truth[:, reference.level(predictor.level).kept]
+    mesh = mesh_of(reference, predictor)
+    own = truth if mesh is None else truth[:, mesh.kept]
     prediction = full_field(reference, predictor, predictor.predict(reference.parameters[run], reference.time))
     # A reduction is asked about whole states; what is gone there stays where it was.
     again = node_distance(truth, full_field(reference, predictor, predictor.reconstruct(held(own))))
@@ -173,15 +174,22 @@ def full_field(
     `states` are expected, by default all of the reference. Raises EvaluationError where the predictor gave another
     shape than its level has.
     """
-    expected = (len(reference.time) if states is None else states, reference.level_nodes(predictor.level), 3)
+    mesh = mesh_of(reference, predictor)
+    nodes = reference.n_nodes if mesh is None else len(mesh.kept)
+    expected = (len(reference.time) if states is None else states, nodes, 3)
     if field.shape != expected:
         raise EvaluationError(
             f"gave an array of shape {field.shape}; expected {expected} on level {predictor.level} of this dataset; "
             f"evaluate it with the dataset it was trained on"
         )
+    return np.asarray(field, dtype=np.float32) if mesh is None else lift(field, mesh.to_full)
+
+
+def mesh_of(reference: Reference, predictor: Predictor) -> Mesh | None:
+    """The coarse mesh `predictor` works on: its own, or the dataset's level; None for the full mesh."""
     if predictor.level == 0:
-        return np.asarray(field, dtype=np.float32)
-    return lift(field, reference.level(predictor.level).to_full)
+        return None
+    return predictor.mesh if predictor.mesh is not None else reference.level(predictor.level)
 
 
 def _on_levels(reference: Reference, distance: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -63,7 +63,7 @@ def performance(evaluation: Evaluation) -> list[Performance]:
             Performance(
                 model=entry.label,
                 level=entry.level,
-                nodes=evaluation.reference.level_nodes(entry.level),
+                nodes=evaluation.nodes(entry),
                 seeds=len(entry.keys),
                 error_cm=scores.mean * CM,
                 spread_cm=scores.spread * CM,

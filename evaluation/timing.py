@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from evaluation.measures import lift
 from evaluation.predictor import Predictor
 from evaluation.reference import Reference
+from evaluation.scoring import mesh_of
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,8 @@ class Timing:
 def time_predictions(reference: Reference, predictor: Predictor, run: int, repeats: int = 7) -> Timing:
     """Ask `predictor` for run number `run` again and again; the first call is not counted."""
     parameters, times = reference.parameters[run], reference.time
-    to_full = None if predictor.level == 0 else reference.level(predictor.level).to_full.astype("float32")
+    mesh = mesh_of(reference, predictor)
+    to_full = None if mesh is None else mesh.to_full.astype("float32")
 
     def ask(states: int, lifted: bool) -> Callable[[], None]:
         def call() -> None:

@@ -121,9 +121,9 @@ def _use(evaluation: Evaluation) -> list[Statement]:
         limit = NEAR * _error(evaluation, coarse[0])
         light = min(
             (e for e in coarse if _error(evaluation, e) <= limit),
-            key=lambda e: evaluation.reference.level_nodes(e.level),
+            key=evaluation.nodes,
         )
-        nodes, full = evaluation.reference.level_nodes(light.level), evaluation.reference.n_nodes
+        nodes, full = evaluation.nodes(light), evaluation.reference.n_nodes
         own = float(masked_mean(scores[light.label].on_level[..., light.level]))
         out.append(
             Statement(

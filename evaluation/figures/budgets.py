@@ -91,9 +91,9 @@ class Budgets:
             if not any(y.lifted <= x.lifted and y.error < x.error for k, y in self.budgets.items() if k != m)
         ]  # fmt: skip
         return (
-            f"Left: seconds an epoch took in training (models fitted in one go have none). Middle: milliseconds "
+            f"First: seconds an epoch took in training (models fitted in one go have none). Second: milliseconds "
             f"a state "
-            f"of a whole run on the model's own mesh, and pale with lifting to the full mesh. Right: error against "
+            f"of a whole run on the model's own mesh, and pale with lifting to the full mesh. Third: error against "
             f"the time of a prediction on the full mesh; only {', '.join(front)} are not beaten in both at once. "
             f"Fastest "
             f"is {fastest} ({f.lifted:.3g} ms, {f.error * CM:.2f} cm), most accurate {best} ({b.lifted:.3g} ms, "

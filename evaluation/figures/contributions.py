@@ -61,6 +61,8 @@ class Contributions:
         # The shown states are all there are: name each by its share of the last time.
         span = self.time[-1] - self.time[0]
         shares = [(t - self.time[0]) / span for t in self.time] if span > 0 else [1.0]
+        if sheet.narrow and len(shares) > 2:  # three pictures side by side are too small on a phone
+            shares = [shares[0], shares[-1]]
         return states_picture(self.position, self.faces, self.time, rows, shares, sheet)
 
     def caption(self) -> str:

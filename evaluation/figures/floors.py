@@ -103,8 +103,9 @@ class Floors:
         )
         share = 100 * min(1.0, p.reduction / p.total)
         return (
-            f"Left: the line is what a linear reduction of the test runs costs before any regression; a model above it "
-            f"loses the rest to regression, a model below it reduces better than POD with as many numbers. Right: the "
+            f"First: the line is what a linear reduction of the test runs costs before any regression; a model "
+            f"above it "
+            f"loses the rest to regression, a model below it reduces better than POD with as many numbers. Second: the "
             f"full bar is the error of encoding and decoding the truth, the pale bar the error of the prediction, the "
             f"black mark what lifting from the coarse mesh costs even if all else were exact. For {best}, "
             f"{modes}, and reduction makes {share:.0f} % of the size of its error."

@@ -81,7 +81,7 @@ class IntrusionFigure:
         return (
             f"Largest intrusion of each test run ({self.about}), predicted against true; points below the line "
             f"are on the "
-            f"unsafe side. Right: its history in the run with the deepest one. It is {true * CM:.1f} cm on average; "
+            f"unsafe side. Second: its history in the run with the deepest one. It is {true * CM:.1f} cm on average; "
             f"{best} misses it by {misses[best] * CM:.2f} cm, {worst} by {misses[worst] * CM:.2f} cm.{said}"
         )
 

@@ -80,8 +80,8 @@ class RigidAndDeformation:
         return (
             f"Each state is split into the best-fitting rigid motion of the whole structure, on average "
             f"{moved * CM:.1f} cm, and the "
-            f"deformation seen by somebody who moves with it, {size * CM:.1f} cm. Left: the errors in both. "
-            f"Right: the error in the "
+            f"deformation seen by somebody who moves with it, {size * CM:.1f} cm. First: the errors in both. "
+            f"Second: the error in the "
             f"deformation alone over time, on the grey ground of its true size; lines that touch the ground's "
             f"edge predict "
             f"no crush. Lowest in deformation: {best}, which misses "

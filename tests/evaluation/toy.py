@@ -21,7 +21,7 @@ class NearestPod:
         modes: int = 4,
         history: Mapping[str, NDArray[np.float64]] | None = None,
     ) -> None:
-        self.name, self.level, self.n_latent = name, level, modes
+        self.name, self.level, self.n_latent, self.mesh = name, level, modes, None
         data = np.concatenate([r.reshape(len(r), -1) for r in runs]).astype(np.float64)
         _, _, vt = np.linalg.svd(data, full_matrices=False)
         self._modes = vt[:modes]

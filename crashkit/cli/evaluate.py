@@ -1,0 +1,372 @@
+"""`crashkit evaluate`: ask every model for the test runs, and write the report and the ParaView files."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from crashkit.cli._console import print_json, progress, say, table
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from evaluation.predictor import Model
+    from evaluation.reference import Reference
+    from evaluation.result import Evaluation
+    from evaluation.scoring import RunScores
+    from surrogates.data import GraphLevel
+    from surrogates.model import Surrogate
+
+Progress = Callable[[str, int, int], None]  # what is being done, steps done, steps in all
+
+
+def evaluate(
+    dataset: str | Path,
+    models: Sequence[str | Path],
+    output: str | Path,
+    *,
+    test: Sequence[str] | None = None,
+    write_vtu: bool = False,
+    vtk_runs: Sequence[str] | None = None,
+    workers: int = 1,
+    scheduler: str | None = None,
+    seeds_as_spread: bool = True,
+    report: Progress | None = None,
+) -> Evaluation:
+    """Compare stored models on runs none of them has seen, and write everything into the folder `output`.
+
+    dataset    path of a crash dataset (.zarr or .nc), with a hierarchy where models work on coarse levels
+    models     model folders; those that differ only in their seed become one row with its spread
+    test       names of the test runs; default: those that all the models hold out
+    write_vtu  also write PVD + VTU and VTKHDF with truth, prediction and error
+    vtk_runs   the runs written so; default: the worst and the median run of the best model
+    workers    processes that share the runs; `scheduler`, the address of a Dask scheduler, is used instead
+    report     called with what is being done and how far it is
+
+    The folder appears under its name when it is complete. Peak memory is one run a worker.
+
+    Raises EvaluationError where the comparison would not be honest or the models do not fit the data, DataError,
+    ReadError and ModelFolderError where files are not what they should be, OutputError where `output` cannot be
+    written.
+    """
+    from evaluation.comparison import agree_on_split, entries
+    from evaluation.output import complete_folder
+    from evaluation.report import write_report
+    from evaluation.result import compare, decompose
+    from evaluation.streaming import over_runs
+
+    tell = report or (lambda what, done, total: None)
+    reference, stored = _opened(str(dataset), tuple(map(str, models)))
+    split = agree_on_split(reference, stored, test)
+    entries(stored, seeds_as_spread)  # refuses what cannot be compared before anything is computed
+    _check_runs(reference, vtk_runs)
+    with complete_folder(Path(output), "report.json") as folder:
+        with _counted(tell, "modes of the training runs", len(split.train)) as step:
+            pods = decompose(reference, split.train, done=step)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".modes-") as kept:
+            job = ScoreJob(str(dataset), tuple(map(str, models)), _keep_modes(pods, Path(kept)))
+            with _counted(tell, "test runs", len(split.test)) as step:
+                scored = over_runs(job, split.test, workers, scheduler, done=step)
+        result = compare(
+            reference, stored, split, seeds_as_spread=seeds_as_spread, pods=pods, scored=scored,
+            context=_context(Path(dataset), reference, stored, split),
+        )  # fmt: skip
+        with _counted(tell, "figures", None) as step:
+            write_report(result, folder, done=lambda name: step(0))
+        if write_vtu:
+            from evaluation.files import default_runs, write_run
+
+            runs = reference.index(vtk_runs) if vtk_runs else default_runs(result)
+            with _counted(tell, "runs for ParaView", len(runs)) as step:
+                for run in runs:
+                    write_run(result, run, folder / "vtk")
+                    step(run)
+    return result
+
+
+@dataclass(frozen=True)
+class ScoreJob:
+    """Scoring one run, to be sent to another process: it opens the files there, once a process."""
+
+    dataset: str
+    models: tuple[str, ...]
+    modes: Mapping[int, str]
+
+    def __call__(self, run: int) -> RunScores:
+        import numpy as np
+
+        from evaluation.result import default_groups, predictors_of
+        from evaluation.scoring import score_run
+
+        reference, models = _opened(self.dataset, self.models)
+        modes = {level: np.load(path, mmap_mode="r", allow_pickle=False) for level, path in self.modes.items()}
+        return score_run(reference, predictors_of(models), run, modes, default_groups(reference)[0])
+
+
+def _keep_modes(pods: Mapping[int, Any], folder: Path) -> dict[int, str]:
+    """Modes as files, which workers map into memory instead of being sent them with every run."""
+    import numpy as np
+
+    out = {}
+    for level, pod in pods.items():
+        path = folder.absolute() / f"level_{level}.npy"
+        np.save(path, pod.modes, allow_pickle=False)
+        out[level] = str(path)
+    return out
+
+
+@functools.lru_cache(maxsize=2)
+def _opened(dataset: str, models: tuple[str, ...]) -> tuple[Reference, tuple[Model, ...]]:
+    """The dataset and the models as evaluation sees them."""
+    from crashkit.cli.predict import load_model
+    from crashkit.dataset import open_dataset
+    from crashkit.errors import DataError
+    from crashkit.mesh.store import read_hierarchy
+    from evaluation.reference import reference_of
+
+    surrogates = [(Path(folder), load_model(folder)) for folder in models]
+    opened = open_dataset(dataset)
+    try:
+        levels = read_hierarchy(dataset).levels
+    except DataError:
+        if any(number > 0 for _, s in surrogates for number in s.level_names.values()):
+            raise
+        levels = ()
+    reference = reference_of(opened, levels, str(opened.attrs.get("checksum", "")))
+    return reference, tuple(as_model(surrogate, folder, reference) for folder, surrogate in surrogates)
+
+
+@dataclass
+class StoredLevel:
+    """One level of a stored surrogate as evaluation asks it (evaluation.predictor.Predictor).
+
+    order  for each parameter of the surrogate, its place among those of the dataset
+    """
+
+    surrogate: Surrogate
+    name: str
+    level: int
+    mesh: GraphLevel | None
+    order: tuple[int, ...]
+    n_parameters: int
+    n_latent: int
+    seconds_per_epoch: float
+    training_seconds: float
+    history: Mapping[str, NDArray[np.float64]]
+
+    def predict(self, parameters: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float32]:
+        return self.surrogate.predict(parameters[list(self.order)], time, self.level)
+
+    def reconstruct(self, displacement: NDArray[np.float32]) -> NDArray[np.float32]:
+        return self.surrogate.reconstruct(displacement, self.level)
+
+
+def as_model(surrogate: Surrogate, folder: Path, reference: Reference) -> Model:
+    """A surrogate, stored in `folder`, as evaluation sees it: one predictor a level, and the runs it has seen.
+
+    Raises EvaluationError where its parameters, nodes or levels are not those of the dataset.
+    """
+    from evaluation.errors import EvaluationError
+    from evaluation.predictor import Model
+
+    names = surrogate.record.ranges.names
+    if sorted(names) != sorted(reference.parameter_names):
+        raise EvaluationError(
+            f"{folder}: the model takes the parameters {', '.join(names)}; the dataset has "
+            f"{', '.join(reference.parameter_names) or 'none'}; give the dataset it was trained on"
+        )
+    if surrogate.graphs.n_nodes(0) != reference.n_nodes:
+        raise EvaluationError(
+            f"{folder}: the model was trained on a mesh of {surrogate.graphs.n_nodes(0)} nodes; the dataset has "
+            f"{reference.n_nodes}; give the dataset it was trained on"
+        )
+    order = tuple(reference.parameter_names.index(n) for n in names)
+    predictors = tuple(
+        StoredLevel(
+            surrogate, name, level, _own_mesh(surrogate, folder, name, level, reference), order,
+            n_parameters=surrogate.n_parameters(level),
+            n_latent=surrogate.n_latent(level),
+            seconds_per_epoch=surrogate.seconds_per_epoch(level),
+            training_seconds=surrogate.training_seconds(level),
+            history=surrogate.history(level),
+        )
+        for name, level in sorted(surrogate.level_names.items(), key=lambda item: item[1])
+    )  # fmt: skip
+    record = surrogate.record
+    configuration = surrogate.settings.model_dump(mode="json")
+    configuration.pop("seed", None)
+    return Model(
+        name=folder.resolve().name,
+        predictors=predictors,
+        fitted_runs=record.fitted_runs,
+        tuned_runs=record.validation_runs,
+        held_out_runs=record.held_out_runs,
+        checksum=record.checksum,
+        seed=record.seed,
+        configuration=configuration,
+    )
+
+
+def _own_mesh(surrogate: Surrogate, folder: Path, name: str, level: int, reference: Reference) -> GraphLevel | None:
+    """The level's own mesh where training refined it; None where it is the dataset's."""
+    import numpy as np
+
+    from evaluation.errors import EvaluationError
+
+    if level == 0 or np.array_equal(surrogate.graphs.kept(level), reference.level(level).kept):
+        return None
+    if surrogate.settings.refinement.adaptive:
+        return surrogate.graphs[level]
+    raise EvaluationError(
+        f"{folder}: {name} was trained on {surrogate.graphs.n_nodes(level)} other nodes than level {level} of the "
+        f"dataset has ({reference.level_nodes(level)}); the dataset was coarsened anew: train the model again"
+    )
+
+
+@contextlib.contextmanager
+def _counted(tell: Progress, what: str, total: int | None) -> Iterator[Callable[[int], None]]:
+    """Report one step after the other under the name `what`."""
+    count = 0
+
+    def step(_: int) -> None:
+        nonlocal count
+        count += 1
+        tell(what, count, total or 0)
+
+    tell(what, 0, total or 0)
+    yield step
+
+
+def _check_runs(reference: Reference, names: Sequence[str] | None) -> None:
+    reference.index(names or ())
+
+
+def _context(dataset: Path, reference: Reference, models: Sequence[Model], split: Any) -> dict[str, str]:
+    """The methods section: what was compared, on what, with what."""
+    import datetime
+    import platform
+    from importlib.metadata import PackageNotFoundError, version
+
+    packages = []
+    for name in ("crashkit", "torch", "scikit-learn", "numpy", "scipy", "xarray", "vtk", "pyvista"):
+        with contextlib.suppress(PackageNotFoundError):
+            packages.append(f"{name} {version(name)}")
+    names = [reference.runs[k] for k in split.test]
+    attributes = reference.attributes
+    return {
+        "Dataset": dataset.name,
+        "Checksum (SHA-256)": reference.checksum or "not recorded",
+        "Solver": attributes.get("solver", "not recorded"),
+        "Runs": f"{len(reference.runs)}, of which {len(names)} test",
+        "Test runs": ", ".join(names),
+        "Parameters": ", ".join(
+            f"{n} ({u})" for n, u in zip(reference.parameter_names, reference.parameter_units, strict=True)
+        )
+        or "none",
+        "States": f"{len(reference.time)} from {reference.time[0] * 1e3:g} to {reference.time[-1] * 1e3:g} ms",
+        "Meshes": ", ".join(f"{reference.level_nodes(k)} nodes (level {k})" for k in range(len(reference.levels) + 1)),
+        "Models": ", ".join(m.name for m in models),
+        "Versions": f"Python {platform.python_version()}, {', '.join(packages)}",
+        "Machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()}",
+        "Made": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
+    }
+
+
+def _processor() -> str:
+    """The processor's name as far as the system tells it."""
+    import platform
+
+    with contextlib.suppress(OSError), Path("/proc/cpuinfo").open(encoding="utf-8") as lines:
+        for line in lines:
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def command(
+    dataset: Annotated[Path, typer.Argument(help="Dataset (.zarr or .nc).", show_default=False)],
+    models: Annotated[list[Path], typer.Argument(help="Model folders made by `crashkit train`.", show_default=False)],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the report.")] = Path("report"),
+    test: Annotated[
+        str, typer.Option(help="Test runs: 27:36, or names with commas.", show_default="those the models hold out")
+    ] = "",
+    write_vtu: Annotated[
+        bool, typer.Option("--write-vtu", help="Also write PVD + VTU and VTKHDF for ParaView.")
+    ] = False,
+    vtk_runs: Annotated[
+        str, typer.Option(help="Runs written for ParaView.", show_default="the worst and the median of the best model")
+    ] = "",
+    workers: Annotated[int, typer.Option(min=1, help="Processes that share the test runs.")] = 1,
+    scheduler: Annotated[str, typer.Option(help="Address of a Dask scheduler instead.", show_default="none")] = "",
+    seeds_as_spread: Annotated[
+        bool, typer.Option(help="Models that differ only in their seed make one row with its spread.")
+    ] = True,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the performance table as JSON.")] = False,
+) -> None:
+    """Compare models on runs they have never seen: report, figures, numbers, ParaView files."""
+    from dataclasses import asdict
+
+    from crashkit.dataset import open_dataset
+    from evaluation.tables import performance
+
+    names = tuple(map(str, open_dataset(dataset)["sim"].values)) if test or vtk_runs else ()
+    with progress() as bar:
+        tasks: dict[str, Any] = {}
+
+        def follow(what: str, done: int, total: int) -> None:
+            if what not in tasks:
+                tasks[what] = bar.add_task(what, total=total or None, note="")
+                if bar.disable:
+                    say(f"{what} ...")
+            bar.update(tasks[what], completed=done)
+
+        result = evaluate(
+            dataset, models, output,
+            test=_named(names, test) if test else None,
+            write_vtu=write_vtu,
+            vtk_runs=_named(names, vtk_runs if ":" in vtk_runs else vtk_runs.split(",")) if vtk_runs else None,
+            workers=workers, scheduler=scheduler or None, seeds_as_spread=seeds_as_spread, report=follow,
+        )  # fmt: skip
+    rows = performance(result)
+    if as_json:
+        print_json({"output": output, "report": output / "report.html", "performance": [asdict(r) for r in rows]})
+        return
+    several = any(row.seeds > 1 for row in rows)
+    table(
+        f"Mean node error on {len(result.runs)} test runs, on the full mesh",
+        (
+            "model", "nodes", "error (cm)", *(["± seeds"] if several else []), "relative", "worst run (cm)",
+            "reduction (cm)", "POD floor (cm)", "parameters", "training (s)", "ms a state",
+        ),
+        (
+            (
+                r.model, r.nodes, f"{r.error_cm:.3f}", *([f"{r.spread_cm:.3f}"] if several else []),
+                f"{100 * r.relative:.1f} %", f"{r.worst_run_cm:.2f} ({r.worst_run})", f"{r.reduction_cm:.3f}",
+                f"{r.pod_floor_cm:.3f}", r.parameters, _or_dash(r.training_s, ".1f"),
+                _or_dash(r.prediction_lifted_ms, ".3g"),
+            )
+            for r in rows
+        ),
+    )  # fmt: skip
+    for path in (output / "report.html", output / "report.json", *sorted((output / "vtk").glob("*.pvd"))):
+        say(f"  {path}")
+
+
+def _named(names: Sequence[str], chosen: str | list[str]) -> list[str]:
+    """Names of the runs that an option means."""
+    from crashkit.dataset import runs_of
+
+    return [names[k] for k in runs_of(names, chosen)]
+
+
+def _or_dash(value: float, form: str) -> str:
+    return format(value, form) if value == value else "–"
