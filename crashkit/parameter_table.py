@@ -1,110 +1,140 @@
 """Design parameters from a table beside the runs: CSV, JSON or XLSX, one row a run.
 
-The column `run` names the run as its source does; every other column is a parameter, its unit in brackets behind
-the name (`impact_speed [m/s]`) or in a YAML file of the same name beside the table (`impact_speed: m/s`).
+The column `run` names the run as the dataset does; every other column is a parameter, with its unit in brackets
+behind the name (`impact_speed [m/s]`) or in a YAML file of the same name beside the table (`impact_speed: m/s`).
+JSON is a list of such rows, or an object of them by run name.
 """
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from crashkit.errors import DataError, ReadError
-from crashkit.readers.base import Parameter
 
-_HEADER = re.compile(r"^\s*(?P<name>[^\[(]+?)\s*(?:[\[(](?P<unit>[^\])]*)[\])])?\s*$")
+_HEADER = re.compile(r"\s*(?P<name>[^\[(]+?)\s*(?:[\[(](?P<unit>[^\])]*)[\])])?\s*")
+_KEYS = ("run", "sim", "name")
+SUFFIXES = (".csv", ".json", ".xlsx")
 
 
 @dataclass(frozen=True)
 class ParameterTable:
-    """Rows by run name, and where they come from."""
+    """Rows by run name: parameter name -> (value, unit as written, "" where none is)."""
 
     path: Path
-    rows: Mapping[str, Mapping[str, Parameter]]
+    rows: Mapping[str, Mapping[str, tuple[float, str]]]
 
-    def match(self, runs: Sequence[str]) -> list[str]:
-        """What does not fit: runs without a row, rows without a run; each by name."""
-        without_row = [r for r in runs if r not in self.rows]
-        without_run = [r for r in self.rows if r not in set(runs)]
-        out = []
-        if without_row:
-            out.append(f"{self.path}: no row for run {', '.join(without_row)}")
-        if without_run:
-            out.append(f"{self.path}: row for {', '.join(without_run)}, but there is no such run")
-        return out
+    def row(self, run: str) -> Mapping[str, tuple[float, str]]:
+        """The parameters of `run`. Raises DataError if it has no row."""
+        if run not in self.rows:
+            names = list(self.rows)
+            known = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+            raise DataError(f"{self.path}: has no row for run {run}; its rows are for {known}")
+        return self.rows[run]
 
 
 def read_parameter_table(path: Path) -> ParameterTable:
     """The table at `path`, told by its suffix.
 
-    Raises ReadError with the row and column of what cannot be understood, DataError for a run with two rows.
+    Raises ReadError with the row and column of what cannot be understood, DataError naming a run with two rows.
     """
-    frame_rows, header = _load(path)
-    names: dict[str, tuple[str, str]] = {}
+    header, lines = _load(path)
+    columns: dict[str, tuple[str, str]] = {}
     for column in header:
-        match = _HEADER.match(str(column))
+        match = _HEADER.fullmatch(column)
         if match is None:
             raise ReadError(f"{path}: column {column!r} is no parameter name; expected name or name [unit]")
-        names[str(column)] = (re.sub(r"\W+", "_", match["name"].strip()), (match["unit"] or "").strip())
-    key = next((c for c, (n, _) in names.items() if n.lower() in ("run", "sim", "name")), None)
+        columns[column] = (re.sub(r"\W+", "_", match["name"]), (match["unit"] or "").strip())
+    key = next((c for c, (name, _) in columns.items() if name.lower() in _KEYS), None)
     if key is None:
-        raise ReadError(f"{path}: no column called run; its columns are {', '.join(map(str, header))}")
+        raise ReadError(f"{path}: no column called run; its columns are {', '.join(header) or 'none'}")
     units = _units_beside(path)
-    rows: dict[str, dict[str, Parameter]] = {}
-    for number, row in enumerate(frame_rows, 2):
-        run = str(row[key]).strip()
+    rows: dict[str, dict[str, tuple[float, str]]] = {}
+    twice: list[str] = []
+    for number, line in enumerate(lines, 2):
+        run = _text(line.get(key))
+        if not run:
+            raise ReadError(f"{path}: row {number} names no run in column {key!r}")
         if run in rows:
-            raise DataError(f"{path}: run {run} has two rows (the second is row {number}); keep one")
-        values = {}
-        for column, (name, unit) in names.items():
-            if column == key:
-                continue
-            try:
-                value = float(row[column])
-            except (TypeError, ValueError):
-                value = float("nan")
-            if value != value or abs(value) == float("inf"):
-                raise ReadError(f"{path}: row {number} ({run}), column {column}: {row[column]!r} is not a number")
-            values[name] = Parameter(value, unit or units.get(name, ""))
-        rows[run] = values
+            twice.append(run)
+        rows[run] = {
+            name: (_number(line.get(column), f"{path}: row {number} (run {run}), column {column!r}"), unit or units.get(name, ""))
+            for column, (name, unit) in columns.items()
+            if column != key
+        }  # fmt: skip
+    if twice:
+        raise DataError(f"{path}: more than one row for run {', '.join(dict.fromkeys(twice))}; keep one each")
     if not rows:
         raise ReadError(f"{path}: the table has no row")
     return ParameterTable(path, rows)
 
 
-def _load(path: Path) -> tuple[list[dict[Any, Any]], list[str]]:
-    import pandas as pd
-
-    if not path.exists():
+def _load(path: Path) -> tuple[list[str], list[dict[str, Any]]]:
+    """Column names, and one dictionary a row."""
+    if not path.is_file():
         raise ReadError(f"{path}: no such parameter table")
     suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ReadError(f"{path}: a parameter table is {', '.join(SUFFIXES)}, not {suffix or 'without suffix'}")
     try:
-        if suffix == ".csv":
-            frame = pd.read_csv(path, dtype=object, skipinitialspace=True, sep=None, engine="python")
-        elif suffix == ".xlsx":
-            frame = pd.read_excel(path, dtype=object)
-        elif suffix == ".json":
-            import json
-
-            data = json.loads(path.read_text())
-            frame = pd.DataFrame(
-                [{"run": k, **v} for k, v in data.items()] if isinstance(data, dict) else data, dtype=object
-            )
-        else:
-            raise ReadError(f"{path}: a parameter table is .csv, .json or .xlsx, not {suffix or 'without suffix'}")
+        lines = _json_rows(path) if suffix == ".json" else _sheet_rows(path)
     except ReadError:
         raise
     except Exception as error:  # each library below has errors of its own
-        raise ReadError(f"{path}: cannot be read as a table ({' '.join(str(error).split())[:160]})") from error
-    header = [str(c) for c in frame.columns]
-    doubled = {c for c in header if header.count(c) > 1}
-    if doubled:
-        raise ReadError(f"{path}: column {doubled.pop()!r} stands there twice")
-    frame.columns = header
-    return frame.to_dict("records"), header
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise ReadError(f"{path}: cannot be read as a table ({text[:160]})") from error
+    header = [_text(cell) for cell in lines[0]] if lines else []
+    doubled = next((c for c in header if header.count(c) > 1), None)
+    if doubled is not None:
+        raise ReadError(f"{path}: column {doubled!r} stands there twice")
+    if "" in header:
+        raise ReadError(f"{path}: column {header.index('') + 1} has no name")
+    return header, [dict(zip(header, line)) for line in lines[1:] if any(_text(cell) for cell in line)]
+
+
+def _sheet_rows(path: Path) -> list[list[Any]]:
+    import pandas as pd
+
+    if path.suffix.lower() == ".xlsx":
+        frame = pd.read_excel(path, header=None, dtype=object)
+    else:
+        options: dict[str, Any] = {"header": None, "dtype": str, "skipinitialspace": True, "encoding": "utf-8-sig"}
+        with path.open(encoding="utf-8-sig") as stream:
+            first = stream.readline()
+        separator = max(",;\t", key=first.count)  # what the header uses; a single column has none
+        frame = pd.read_csv(path, sep=separator, **options)
+    return [list(row) for row in frame.itertuples(index=False)]
+
+
+def _json_rows(path: Path) -> list[list[Any]]:
+    data = json.loads(path.read_text(encoding="utf-8"))
+    if isinstance(data, dict) and all(isinstance(row, dict) for row in data.values()):
+        data = [{"run": run, **row} for run, row in data.items()]
+    if not isinstance(data, list) or not data or not all(isinstance(row, dict) for row in data):
+        raise ReadError(f"{path}: expected a list of rows, or an object of rows by run name")
+    header = list(dict.fromkeys(column for row in data for column in row))
+    return [header, *([row.get(column) for column in header] for row in data)]
+
+
+def _text(cell: Any) -> str:
+    """A cell as text; spreadsheets keep the number 3 as 3.0 at times."""
+    if cell is None or cell != cell:
+        return ""
+    return str(int(cell)) if isinstance(cell, float) and cell.is_integer() else str(cell).strip()
+
+
+def _number(cell: Any, place: str) -> float:
+    try:
+        value = float(cell)
+    except (TypeError, ValueError):
+        value = float("nan")
+    if value != value or abs(value) == float("inf"):
+        raise ReadError(f"{place}: found {_text(cell) or 'nothing'!r}, expected a number")
+    return value
 
 
 def _units_beside(path: Path) -> Mapping[str, str]:
@@ -112,12 +142,13 @@ def _units_beside(path: Path) -> Mapping[str, str]:
 
     for suffix in (".yaml", ".yml"):
         beside = path.with_suffix(suffix)
-        if beside.exists():
-            try:
-                units = yaml.safe_load(beside.read_text())
-            except yaml.YAMLError as error:
-                raise ReadError(f"{beside}: not readable as YAML ({' '.join(str(error).split())[:160]})") from error
-            if not isinstance(units, dict):
-                raise ReadError(f"{beside}: expected lines of the form parameter: unit")
-            return {str(k): str(v) for k, v in units.items()}
+        if not beside.exists():
+            continue
+        try:
+            units = yaml.safe_load(beside.read_text(encoding="utf-8"))
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            raise ReadError(f"{beside}: not readable as YAML ({' '.join(str(error).split())[:160]})") from error
+        if not isinstance(units, dict):
+            raise ReadError(f"{beside}: expected lines such as impact_speed: m/s")
+        return {str(name): str(unit) for name, unit in units.items()}
     return {}

@@ -1,19 +1,22 @@
-"""How a dataset gets to disk so that a killed process loses nothing that was finished.
+"""The two forms of a dataset on disk, a Zarr folder and a NetCDF4 file, and putting a new one in place of an old one.
 
-Runs are written into a Zarr store `NAME.partial/data` beside the wanted output. A chunk never spans two runs, so each
-run is a set of files of its own; once they are all there, one line in `NAME.partial/journal` says so (written and
-synchronised last). At the end the store is completed, brought to its final form and renamed into place. A later start
-with the same plan goes on behind the last line of the journal.
+Result arrays are kept one run a chunk row: every chunk holds all states of a block of nodes of one run
+(`data_schema.checksum.blocks`), so the chunks of a run are files of their own, and a finished run moves from one
+store into another as hard links.
 """
 
 from __future__ import annotations
 
+import ctypes
+import errno
 import json
 import os
 import shutil
+import sys
 import warnings
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,241 +24,301 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.errors import OutputError
+from data_schema.checksum import block_length
 
 if TYPE_CHECKING:
     import xarray as xr
-    import zarr
 
-# Nodes a chunk: 101 states x 16384 nodes x 3 x 4 bytes are 20 MB, small enough to read alone, large enough to be quick.
-NODE_BLOCK = 16384
+SUFFIXES = (".zarr", ".nc")
 
 
 @dataclass(frozen=True)
 class ArraySpec:
-    """One array on (sim, time, ...) or (sim, ...): what is needed to create it before any run is read."""
+    """A result array of one run: `dims` and `shape` without `sim`, e.g. (time, node, xyz)."""
 
     name: str
     dims: tuple[str, ...]
     shape: tuple[int, ...]
     dtype: str
-    attributes: Mapping[str, Any]
+    attributes: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def chunks(self) -> tuple[int, ...]:
-        sizes = list(self.shape)
-        sizes[0] = 1
-        for axis, dim in enumerate(self.dims):
-            if dim in ("node", "face", "cell"):
-                sizes[axis] = max(1, min(sizes[axis], NODE_BLOCK))
-        return tuple(max(1, s) for s in sizes)
+        """All states of a block of nodes; reference positions (node, xyz) are one chunk."""
+        if self.dims[0] != "time":
+            return self.shape
+        entry = np.dtype(self.dtype).itemsize * int(np.prod(self.shape[2:], dtype=np.int64))
+        return (max(1, self.shape[0]), block_length(self.shape[0], self.shape[1], entry), *self.shape[2:])
+
+    @property
+    def fill(self) -> bool | float:
+        """What stands where nothing was written: missing, or alive."""
+        return True if self.dtype == "bool" else np.nan
 
 
-class Staging:
-    """The folder `NAME.partial` while a dataset is being made."""
+@dataclass(frozen=True)
+class RunSource:
+    """Where the chunks of a run's arrays lie: a Zarr store and the run's place in it."""
 
-    def __init__(self, output: Path) -> None:
-        self.output = output
-        self.folder = output.with_name(output.name + ".partial")
-        self.data = self.folder / "data"
-        self._plan = self.folder / "plan.json"
-        self._journal = self.folder / "journal"
+    store: Path
+    place: int
 
-    def begin(self, plan: Mapping[str, Any]) -> bool:
-        """Start, or go on where an earlier start with the same plan was; True if it goes on.
 
-        Anything left by a different plan is thrown away: it belongs to a command that was given up.
-        """
-        text = json.dumps(plan, sort_keys=True)
-        try:
-            if self._plan.exists() and self._plan.read_text() == text:
-                return True
-            if self.folder.exists():
-                shutil.rmtree(self.folder)
-            self.folder.mkdir(parents=True)
-        except OSError as error:
-            raise OutputError(f"{self.folder}: cannot be written ({error.strerror or error})") from error
-        self._fresh_plan = text
-        return False
+def check_output(output: Path) -> None:
+    """Raise OutputError unless `output` can be made a dataset: its suffix, its folder, and that it can be written."""
+    if output.suffix not in SUFFIXES:
+        raise OutputError(f"{output}: a dataset is called NAME.zarr or NAME.nc; choose such a name")
+    folder = output.absolute().parent
+    if not folder.is_dir():
+        raise OutputError(f"{output}: the folder {folder} does not exist; make it first")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise OutputError(f"{output}: the folder {folder} cannot be written to; choose another")
 
-    def ready(self) -> None:
-        """Note that the empty arrays are all there; from here on a restart goes on instead of starting over."""
-        temporary = self._plan.with_suffix(".new")
-        temporary.write_text(self._fresh_plan)
-        temporary.replace(self._plan)
 
-    def create(self, specs: list[ArraySpec]) -> None:
-        """Make the empty arrays."""
-        root = self._root("w")
+# --- Zarr --------------------------------------------------------------------------------------------------------
+
+
+def create_arrays(store: Path, specs: Sequence[ArraySpec], runs: int) -> dict[str, Any]:
+    """A new Zarr store with empty arrays (sim, ...) for `runs` runs, by name."""
+    import zarr
+    from zarr.codecs import BloscCodec
+
+    group = zarr.open_group(str(store), mode="w")
+    out = {}
+    for spec in specs:
+        # LZ4 behind a byte shuffle keeps pace with the disk; what compresses better writes at half the speed or less.
+        array = group.create_array(
+            spec.name,
+            shape=(runs, *spec.shape),
+            chunks=(1, *spec.chunks),
+            dtype=spec.dtype,
+            fill_value=spec.fill,
+            compressors=BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"),
+            dimension_names=("sim", *spec.dims),
+        )
+        array.attrs.update(dict(spec.attributes))
+        out[spec.name] = array
+    return out
+
+
+def write_zarr(target: Path, small: xr.Dataset, specs: Sequence[ArraySpec], runs: Sequence[RunSource]) -> None:
+    """A whole dataset: `small` as it is, and of every array in `specs` the chunks that the `runs` have.
+
+    A run without an array gets the array's fill value, which takes no space.
+    """
+    import zarr
+
+    create_arrays(target, specs, len(runs))
+    for spec in specs:
+        for place, source in enumerate(runs):
+            chunks = source.store / spec.name / "c" / str(source.place)
+            if chunks.is_dir():
+                shutil.copytree(chunks, target / spec.name / "c" / str(place), copy_function=_link)
+    group = zarr.open_group(str(target), mode="r+")
+    for name, variable in small.variables.items():
+        values = variable.values
+        text = values.dtype.kind in "UOT"
+        array = group.create_array(
+            str(name), shape=values.shape, chunks=tuple(max(1, n) for n in values.shape), dtype=str if text else values.dtype,
+            dimension_names=tuple(map(str, variable.dims)), fill_value=np.nan if values.dtype.kind == "f" else None,
+        )  # fmt: skip
+        array[...] = values.astype(object) if text else values
+        array.attrs.update(_coordinates_named(small, str(name), variable.attrs))
+    group.attrs.update(small.attrs)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that Zarr 3 does not yet specify what xarray looks for first
+        zarr.consolidate_metadata(str(target))
+
+
+def same_layout(store: Path, specs: Sequence[ArraySpec]) -> bool:
+    """Whether the chunks of `store` can stand in a store of arrays `specs` as they are."""
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        create_arrays(Path(folder) / "like", specs, 1)
+        return all(_layout(store / spec.name) in (None, _layout(Path(folder) / "like" / spec.name)) for spec in specs)
+
+
+def _layout(array: Path) -> Any:
+    """What decides how the chunks of an array are read; None where there is no such array."""
+    with suppress(OSError, ValueError):
+        found = json.loads((array / "zarr.json").read_text())
+        return [found["shape"][1:], *(found[k] for k in ("chunk_grid", "codecs", "data_type", "chunk_key_encoding"))]
+    return None
+
+
+def _coordinates_named(small: xr.Dataset, name: str, attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Attributes of a variable; those of node_id also name the coordinates on nodes, for CF readers."""
+    beside = [str(c) for c in small.coords if small[c].dims == small[name].dims and str(c) != name]
+    if name in small.coords or not beside:
+        return dict(attributes)
+    return {**attributes, "coordinates": " ".join(beside)}
+
+
+def _link(source: str, target: str) -> None:
+    """A hard link, or a copy where the disk has none. Chunks are never written again, so sharing them is safe."""
+    try:
+        os.link(source, target)
+    except OSError as error:
+        if error.errno == errno.ENOSPC:
+            raise
+        shutil.copyfile(source, target)
+
+
+# --- NetCDF ------------------------------------------------------------------------------------------------------
+
+
+def write_netcdf(target: Path, small: xr.Dataset, specs: Sequence[ArraySpec], runs: Sequence[RunSource]) -> None:
+    """The same content as `write_zarr`, as one NetCDF4 file, copied block by block."""
+    import netCDF4
+
+    sizes = {str(d): n for d, n in small.sizes.items()} | {"sim": len(runs)}
+    for spec in specs:
+        sizes |= dict(zip(spec.dims, spec.shape))
+    with netCDF4.Dataset(str(target), "w") as out:
+        out.setncatts(small.attrs)
+        for dim, size in sizes.items():
+            out.createDimension(dim, size)
+        for name, variable in small.variables.items():
+            attributes = _coordinates_named(small, str(name), variable.attrs)
+            written = _create(out, str(name), tuple(map(str, variable.dims)), variable.dtype, attributes)
+            written[...] = variable.values.astype(object) if written.dtype is str else variable.values
         for spec in specs:
-            fill: Any = False if spec.dtype == "bool" else (np.nan if spec.dtype.startswith("float") else 0)
-            array = root.create_array(
-                spec.name,
-                shape=spec.shape,
-                chunks=spec.chunks,
-                dtype=spec.dtype,
-                fill_value=fill,
-                dimension_names=spec.dims,
-                compressors=_compressor(spec.dtype),
-                config={"write_empty_chunks": True},
+            written = _create(
+                out, spec.name, ("sim", *spec.dims), np.dtype(spec.dtype), dict(spec.attributes), (1, *spec.chunks)
             )
-            array.attrs.update(dict(spec.attributes))
+            for place, source in enumerate(runs):
+                for block, values in _stored_blocks(source, spec):
+                    written[(place, *block)] = values
 
-    def array(self, name: str) -> zarr.Array:
-        array: Any = self._root("r+")[name]
-        return array.with_config({"write_empty_chunks": True})
 
-    def _root(self, mode: Any) -> zarr.Group:
-        import zarr
+def _create(
+    out: Any, name: str, dims: tuple[str, ...], dtype: Any, attributes: dict[str, Any], chunks: Any = None
+) -> Any:
+    if dtype.kind in "UOT":
+        variable = out.createVariable(name, str, dims)
+    else:
+        options: dict[str, Any] = {"fill_value": np.nan} if dtype.kind == "f" else {}
+        if dims:
+            options |= {"compression": "zlib", "complevel": 1, "shuffle": True, "chunksizes": chunks}
+        variable = out.createVariable(name, "i1" if dtype.kind == "b" else dtype, dims, **options)
+    if dtype.kind == "b":
+        attributes["dtype"] = "bool"  # how xarray remembers what NetCDF has no type for
+    variable.setncatts(attributes)
+    return variable
 
-        return zarr.open_group(str(self.data), mode=mode)
 
-    def finished(self) -> dict[int, dict[str, Any]]:
-        """What the journal says: record by slot. A torn last line is ignored; its run is written again."""
-        if not self._journal.exists():
-            return {}
-        out = {}
-        for line in self._journal.read_text().splitlines():
-            try:
-                record = json.loads(line)
-            except ValueError:
+def _stored_blocks(source: RunSource, spec: ArraySpec) -> Iterator[tuple[tuple[slice, ...], NDArray]]:
+    """(where, values) of a run's array, block by block; the fill value where the run has no such array."""
+    import zarr
+
+    folder = source.store / spec.name
+    array = zarr.open_array(str(folder), mode="r") if (folder / "zarr.json").exists() else None
+    axis = 1 if spec.dims[0] == "time" else 0
+    length, step = spec.shape[axis], spec.chunks[axis]
+    for first in range(0, length, step):
+        where = (slice(None),) * axis + (slice(first, min(first + step, length)),)
+        if array is not None:
+            yield where, np.asarray(array[(source.place, *where)])
+        else:
+            shape = list(spec.shape)
+            shape[axis] = min(first + step, length) - first
+            yield where, np.full(shape, spec.fill, spec.dtype)
+
+
+def read_array(source: RunSource, name: str) -> NDArray:
+    """A run's whole array."""
+    import zarr
+
+    return np.asarray(zarr.open_array(str(source.store / name), mode="r")[source.place])
+
+
+def zarr_from(dataset: xr.Dataset, specs: Sequence[ArraySpec], target: Path) -> None:
+    """The result arrays of an open dataset as a Zarr store of the layout `specs`, run by run and block by block."""
+    arrays = create_arrays(target, [s for s in specs if s.name in dataset.variables], dataset.sizes["sim"])
+    for spec in specs:
+        if spec.name not in arrays:
+            continue
+        shared = "sim" not in dataset[spec.name].dims
+        for run in range(dataset.sizes["sim"]):
+            values = dataset[spec.name] if shared else dataset[spec.name].isel(sim=run)
+            if spec.dims[0] != "time":
+                arrays[spec.name][run] = values.values
                 continue
-            out[int(record["slot"])] = record
-        return out
-
-    def note(self, record: Mapping[str, Any]) -> None:
-        """Add a finished run to the journal."""
-        with self._journal.open("a") as stream:
-            stream.write("\n" + json.dumps(dict(record)) + "\n")
-            stream.flush()
-            os.fsync(stream.fileno())
-
-    def compact(self, slots: list[int], names: list[str]) -> None:
-        """Keep only `slots` (increasing) of the arrays `names`, moved together at the front.
-
-        A chunk's file lies under `c/<sim>/`, since no chunk spans two runs: moving a run is renaming a folder. They
-        are gathered in a folder beside `c`, so that a start after a kill sees which were moved before.
-        """
-        root = self._root("r+")
-        for name in names:
-            array: Any = root[name]
-            if array.shape[0] == len(slots):
-                continue
-            chunks, kept = self.data / name / "c", self.data / name / "c.kept"
-            kept.mkdir(exist_ok=True)
-            for new, old in enumerate(slots):
-                if (chunks / str(old)).exists() and not (kept / str(new)).exists():
-                    (chunks / str(old)).replace(kept / str(new))
-            if chunks.exists():
-                shutil.rmtree(chunks)
-            kept.replace(chunks)
-            array.resize((len(slots), *array.shape[1:]))
-
-    def adopt(self, dataset: Path, specs: list[ArraySpec], slots: list[int]) -> None:
-        """Take the runs `slots` of an existing Zarr dataset over, as hard links where the disk allows."""
-        for spec in specs:
-            for slot in slots:
-                source = dataset / spec.name / "c" / str(slot)
-                if source.exists():
-                    shutil.copytree(
-                        source, self.data / spec.name / "c" / str(slot), copy_function=_link, dirs_exist_ok=True
-                    )
-
-    def publish(self, constants: xr.Dataset) -> None:
-        """Add what does not depend on the run, bring the store to the form of the output, and rename it into place."""
-        check_suffix(self.output)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Zarr says of text arrays that their format is young
-            constants.to_zarr(str(self.data), mode="a", consolidated=False, encoding={})
-        try:
-            if self.output.suffix == ".nc":
-                finished = self.folder / "data.nc"
-                _to_netcdf(self.data, finished)
-            else:
-                finished = self.data
-            replace(finished, self.output)
-            shutil.rmtree(self.folder, ignore_errors=True)
-        except OSError as error:
-            raise OutputError(f"{self.output}: cannot be put into place ({error.strerror or error})") from error
+            for first in range(0, spec.shape[1], spec.chunks[1]):
+                part = slice(first, first + spec.chunks[1])
+                arrays[spec.name][run, :, part] = values[:, part].values
 
 
-def check_suffix(output: Path) -> None:
-    """Raise OutputError unless the name ends in .zarr or .nc."""
-    if output.suffix not in (".zarr", ".nc"):
-        raise OutputError(f"{output}: a dataset is called something.zarr or something.nc")
+# --- putting in place --------------------------------------------------------------------------------------------
 
 
-def replace(new: Path, old: Path) -> None:
-    """Put `new` where `old` is. At any moment one of the two is whole, under its name or `NAME.replaced`."""
-    aside = old.with_name(old.name + ".replaced")
-    if old.is_dir():
-        if aside.exists():
-            shutil.rmtree(aside)
-        old.replace(aside)
-    new.replace(old)
-    if aside.exists():
-        shutil.rmtree(aside)
+def put_in_place(new: Path, output: Path) -> None:
+    """Make `new` the dataset `output`; what stood there is gone afterwards. `new` is on the disk before.
+
+    A file, and a folder that was not there, appears in one step. A folder that was there is exchanged in one step
+    where the system can do that (Linux); elsewhere it is first set aside, and `recover` brings it back if the
+    process dies in between.
+    """
+    _synchronise(new)
+    if not output.is_dir():
+        new.replace(output)
+    elif not _exchange(new, output):
+        output.replace(_aside(new, output))
+        new.replace(output)
+    _synchronise_folder(output.absolute().parent)
+    for left in (_aside(new, output), new):
+        remove(left)
 
 
-def recover(output: Path) -> None:
-    """Undo a replacement that was killed between its two steps."""
-    aside = output.with_name(output.name + ".replaced")
+def recover(staging: Path, output: Path) -> None:
+    """Bring back a dataset that was set aside when the process died."""
+    aside = staging / f"replaced{output.suffix}"
     if aside.exists() and not output.exists():
         aside.replace(output)
 
 
-def _compressor(dtype: str) -> Any:
-    from zarr.codecs import BloscCodec
-
-    # Displacements are noise in their low bytes: bitshuffle with lz4 keeps pace with a disk and still halves them.
-    return BloscCodec(cname="lz4", clevel=3, shuffle="bitshuffle" if dtype != "bool" else "shuffle")
-
-
-def _link(source: str, target: str) -> None:
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copy2(source, target)
-
-
-def _to_netcdf(store: Path, file: Path) -> None:
-    """The same content as one NetCDF4 file, copied run by run."""
-    import netCDF4
-    import xarray as xr
-
-    with (
-        xr.open_dataset(str(store), engine="zarr", consolidated=False, chunks=None, decode_cf=False) as source,
-        netCDF4.Dataset(str(file), "w") as out,
-    ):
-        out.setncatts(source.attrs)
-        for dim, size in source.sizes.items():
-            out.createDimension(str(dim), size)
-        for name, variable in source.variables.items():
-            _copy_variable(out, str(name), variable)
-
-
-def _copy_variable(out: Any, name: str, variable: xr.Variable) -> None:
-    text = variable.dtype.kind in "UOT"
-    kind: Any = str if text else ("i1" if variable.dtype.kind == "b" else variable.dtype)
-    options: dict[str, Any] = {}
-    if not text and variable.ndim:
-        options = {"compression": "zlib", "complevel": 1, "shuffle": True}
-        if variable.dims[0] == "sim" and variable.ndim > 1:
-            options["chunksizes"] = ArraySpec(name, tuple(map(str, variable.dims)), variable.shape, "", {}).chunks
-    if variable.dtype.kind == "f":
-        options["fill_value"] = np.nan
-    target = out.createVariable(name, kind, variable.dims, **options)
-    attributes = {k: v for k, v in variable.attrs.items() if k != "_FillValue"}
-    if variable.dtype.kind == "b":
-        attributes["dtype"] = "bool"  # how xarray remembers what NetCDF has no type for
-    target.setncatts(attributes)
-    for block in _blocks(variable):
-        values: NDArray[Any] = np.asarray(variable[block].values)
-        target[block] = values.astype(object) if text else (values.astype("i1") if values.dtype.kind == "b" else values)
-
-
-def _blocks(variable: xr.Variable) -> Iterator[Any]:
-    if variable.ndim and variable.dims[0] == "sim" and variable.ndim > 1:
-        for k in range(variable.shape[0]):
-            yield (slice(k, k + 1),)
+def remove(path: Path) -> None:
+    """Delete a file or folder if it is there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
     else:
-        yield (Ellipsis,)
+        path.unlink(missing_ok=True)
+
+
+def _aside(new: Path, output: Path) -> Path:
+    return new.with_name(f"replaced{output.suffix}")
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Let two folders change places in one step; False where the system cannot."""
+    if not sys.platform.startswith("linux"):
+        return False
+    here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE of renameat2(2)
+    try:
+        rename = ctypes.CDLL(None, use_errno=True).renameat2
+    except AttributeError:  # a C library from before 2018
+        return False
+    return rename(here, os.fsencode(one), here, os.fsencode(other), ctypes.c_uint(exchange)) == 0
+
+
+def _synchronise(path: Path) -> None:
+    """Have everything under `path` on the disk, so that a power cut after the renaming finds it whole."""
+    files = [path] if path.is_file() else [Path(folder) / f for folder, _, names in os.walk(path) for f in names]
+    for file in files:
+        handle = os.open(file, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+    if path.is_dir():
+        for folder, _, _ in os.walk(path):
+            _synchronise_folder(Path(folder))
+
+
+def _synchronise_folder(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,14 +1,15 @@
 """From a solver's mesh to the structure that a dataset holds: which parts, faces, cells and nodes stay.
 
 Rigid walls and nodes that nothing of the structure uses are left out; solids contribute their outer skin to the
-faces. All node numbers here are 0-based.
+faces, as it is in the undeformed state (faces that erosion lays bare later are not added). All node numbers here are
+0-based.
 """
 
 from __future__ import annotations
 
 import fnmatch
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,7 +65,8 @@ def structure_of(
 
     Raises DataError if a pattern matches no part, or if nothing is left.
     """
-    chosen = _choose(mesh.parts, parts, exclude_parts, keep_rigid_walls)
+    chosen, notes = _choose(mesh.parts, parts, exclude_parts, keep_rigid_walls)
+    chosen = chosen[np.isin(chosen, mesh.face_part) | np.isin(chosen, mesh.cell_part)]  # empty parts say nothing
     new_part = np.full(len(mesh.parts) + 1, -1, np.int32)  # one more, so that part -1 (none) stays -1
     new_part[chosen] = np.arange(len(chosen))
 
@@ -74,7 +76,8 @@ def structure_of(
     corners = _stack(mesh.face_nodes[shells], skin_nodes)
     if len(corners) == 0 and len(cells) == 0:
         raise DataError(
-            f"nothing is left of the mesh: of {len(mesh.parts)} parts {len(chosen)} were chosen and they have no element"
+            f"nothing is left of the mesh: {len(chosen)} of {len(mesh.parts)} parts were chosen, and they have no "
+            "element; choose others with --parts"
         )
 
     used = np.zeros(len(mesh.position), bool)
@@ -84,13 +87,9 @@ def structure_of(
     number = np.full(len(used) + 1, -1, np.int32)  # the last entry keeps -1 where a corner is -1
     number[node] = np.arange(len(node))
 
-    notes = []
-    walls = [p.name or str(p.id) for p in mesh.parts if p.rigid_wall]
-    if walls and not keep_rigid_walls and not parts:
-        notes.append(f"rigid walls left out: {', '.join(walls)}")
     left_out = len(used) - len(node)
     if left_out:
-        notes.append(f"{left_out} of {len(used)} nodes left out: no element of the chosen parts uses them")
+        notes.append(f"{left_out} of {len(used)} nodes left out: no element that stays uses them")
     ids = mesh.node_id[node]
     if len(np.unique(ids)) != len(ids):
         raise DataError(
@@ -114,90 +113,99 @@ def structure_of(
     )
 
 
-def match_nodes(reference: Structure, other: Structure) -> Structure:
-    """`other` with its nodes and faces in the order of `reference`, told by their numbers.
+def matched(reference: Structure, other: Structure) -> Structure:
+    """`other` with its nodes, faces and cells in the order of `reference`, told by their numbers.
 
-    Raises DataError if the two are not the same mesh: other node numbers, other faces or cells.
+    Raises DataError if the two are not the same mesh: other node numbers, other elements, elements in other parts.
     """
-    if np.array_equal(reference.node_id, other.node_id) and np.array_equal(reference.face_nodes, other.face_nodes):
+    if np.array_equal(reference.node_id, other.node_id):
         order = np.arange(reference.n_nodes)
     else:
         missing = np.setdiff1d(reference.node_id, other.node_id)
         extra = np.setdiff1d(other.node_id, reference.node_id)
         if len(missing) or len(extra):
+            named = f"number {missing[0]} is missing" if len(missing) else f"number {extra[0]} is new"
             raise DataError(
-                f"its mesh differs: {reference.n_nodes} nodes in the first run, {other.n_nodes} here "
-                f"({len(missing)} node numbers missing, {len(extra)} new); runs of one dataset share one mesh"
+                f"its mesh has {other.n_nodes} nodes, that of the first run {reference.n_nodes} ({named}); the runs of "
+                "a dataset share one mesh: ingest this run apart, or choose parts that all runs have"
             )
         by_id = np.argsort(other.node_id)
         order = by_id[np.searchsorted(other.node_id[by_id], reference.node_id)]
-    place = np.full(other.n_nodes + 1, -1, np.int32)
+    place = np.full(other.n_nodes + 1, -1, np.int32)  # the last entry keeps -1 where a corner is -1
     place[order] = np.arange(len(order))
-    faces = _match_rows(reference.face_nodes, place[other.face_nodes], reference.face_id, other.face_id, "faces")
-    cells = _match_rows(reference.cell_nodes, place[other.cell_nodes], reference.cell_id, other.cell_id, "cells")
-    return Structure(
+    faces = _match_elements("faces", _rows(reference, "face"), _rows(other, "face", place))
+    cells = _match_elements("cells", _rows(reference, "cell"), _rows(other, "cell", place))
+    return replace(
+        reference,
         node=other.node[order],
-        node_id=other.node_id[order],
         position=other.position[order],
-        face_nodes=reference.face_nodes,
-        face_part=reference.face_part,
-        face_id=reference.face_id,
         face_source=other.face_source[faces],
-        cell_nodes=reference.cell_nodes,
-        cell_type=reference.cell_type,
-        cell_part=reference.cell_part,
-        cell_id=reference.cell_id,
         cell_source=other.cell_source[cells],
-        parts=reference.parts,
         notes=other.notes,
     )
 
 
-def _match_rows(
-    reference: NDArray[np.int32],
-    rows: NDArray[np.int32],
-    ids: NDArray[np.int64],
-    other_ids: NDArray[np.int64],
-    what: str,
-) -> NDArray[np.int64]:
-    """For each reference row the place of the equal row (as a set of nodes, same element number) in `rows`."""
-    if np.array_equal(reference, rows) and np.array_equal(ids, other_ids):
-        return np.arange(len(reference))
-    if reference.shape != rows.shape:
-        raise DataError(f"its mesh differs: {len(reference)} {what} in the first run, {len(rows)} here")
-    mine = np.column_stack([ids, np.sort(reference, axis=1)])
-    theirs = np.column_stack([other_ids, np.sort(rows, axis=1)])
-    a, b = np.lexsort(mine.T[::-1]), np.lexsort(theirs.T[::-1])
-    if not np.array_equal(mine[a], theirs[b]):
-        differing = int((mine[a] != theirs[b]).any(axis=1).sum())
+def _rows(s: Structure, kind: str, place: NDArray[np.int32] | None = None) -> NDArray[np.int64]:
+    """One row an element: number, part number, its nodes in the order of their numbers (renumbered by `place`)."""
+    nodes, part, number = (getattr(s, f"{kind}_{what}") for what in ("nodes", "part", "id"))
+    part_id = np.array([p.id for p in s.parts], np.int64)
+    corners = np.full((len(nodes), max(4, nodes.shape[1])), -1, np.int64)  # triangles are 3 wide where alone
+    corners[:, : nodes.shape[1]] = nodes if place is None else place[nodes]
+    return np.column_stack([number, part_id[part], np.sort(corners, axis=1)]).astype(np.int64)
+
+
+def _match_elements(what: str, mine: NDArray[np.int64], theirs: NDArray[np.int64]) -> NDArray[np.int64]:
+    """For each row of `mine` the place of the equal row in `theirs`."""
+    if np.array_equal(mine, theirs):
+        return np.arange(len(mine))
+    if mine.shape != theirs.shape:
         raise DataError(
-            f"its mesh differs: about {differing} of {len(reference)} {what} join other nodes than in the first run"
+            f"its mesh has {len(theirs)} {what}, that of the first run {len(mine)}; the runs of a dataset share one mesh"
         )
-    out = np.empty(len(reference), np.int64)
+    a, b = np.lexsort(mine.T[::-1]), np.lexsort(theirs.T[::-1])
+    differing = (mine[a] != theirs[b]).any(axis=1)
+    if differing.any():
+        number, part = mine[a][np.argmax(differing)][:2]
+        raise DataError(
+            f"its mesh differs from that of the first run in {int(differing.sum())} of {len(mine)} {what} (around "
+            f"element {number}, part {part}); the runs of a dataset share one mesh"
+        )
+    out = np.empty(len(mine), np.int64)
     out[a] = b
     return out
 
 
-def _choose(known: Sequence[Part], include: Sequence[str], exclude: Sequence[str], walls: bool) -> NDArray[np.int64]:
-    def matching(pattern: str) -> set[int]:
-        found = {
-            k for k, p in enumerate(known)
-            if str(p.id) == pattern or fnmatch.fnmatchcase(p.name, pattern) or p.name == pattern
-        }  # fmt: skip
-        if not found:
-            listing = ", ".join(f"{p.id} ({p.name})" if p.name else str(p.id) for p in list(known)[:12])
-            raise DataError(
-                f"no part is called {pattern!r}; the runs have {listing}{' ...' if len(known) > 12 else ''}"
-            )
-        return found
+def _choose(
+    known: Sequence[Part], include: Sequence[str], exclude: Sequence[str], walls: bool
+) -> tuple[NDArray[np.int64], list[str]]:
+    """Places of the parts that stay, and notes. A rigid wall stays if it is asked for by its number or full title."""
 
+    def matching(pattern: str) -> tuple[set[int], set[int]]:
+        exact = {k for k, p in enumerate(known) if pattern in (str(p.id), p.name)}
+        found = exact or {k for k, p in enumerate(known) if fnmatch.fnmatchcase(p.name, pattern)}
+        if not found:
+            listing = ", ".join(f"{p.id} ({p.name})" if p.name else str(p.id) for p in known[:12])
+            raise DataError(
+                f"no part is called {pattern!r}; the runs have {listing}{' ...' if len(known) > 12 else ''}; "
+                "name parts by number, title or pattern such as 'rail*'"
+            )
+        return found, exact
+
+    kept, asked_for = set(range(len(known))), set()
     if include:
-        kept = set().union(*(matching(pattern) for pattern in include))
-    else:
-        kept = {k for k, p in enumerate(known) if walls or not p.rigid_wall}
+        matches = [matching(pattern) for pattern in include]
+        kept = set().union(*(found for found, _ in matches))
+        asked_for = set().union(*(exact for _, exact in matches))
     for pattern in exclude:
-        kept -= matching(pattern)
-    return np.array(sorted(kept), np.int64)
+        kept -= matching(pattern)[0]
+    dropped = set() if walls else {k for k in kept if known[k].rigid_wall and k not in asked_for}
+    kept -= dropped
+    notes = []
+    if dropped:
+        notes.append(f"rigid walls left out: {', '.join(known[k].name or str(known[k].id) for k in sorted(dropped))}")
+    if include or exclude:
+        notes.append(f"{len(kept)} of {len(known)} parts chosen")
+    return np.array(sorted(kept), np.int64), notes
 
 
 def _skin(mesh: RunMesh, cells: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:

@@ -1,9 +1,11 @@
 """What a crash dataset is.
 
 Read `layout.py` to know every dimension, variable, unit and attribute; `validation.py` holds the rules a
-dataset must pass; `units.py` the unit systems crash solvers are run in. Nothing here reads or writes files.
+dataset must pass; `checksum.py` how its content is identified; `units.py` the unit systems crash solvers are run in.
+Nothing here reads or writes files.
 """
 
+from data_schema.checksum import dataset_checksum, digests_of_run, run_checksum
 from data_schema.layout import (
     ATTRIBUTES,
     CONVENTIONS,
@@ -14,7 +16,7 @@ from data_schema.layout import (
     fields,
     parameters,
 )
-from data_schema.units import UnitSystem, UnknownUnits, to_si, unit_system
+from data_schema.units import UnitSystem, UnknownUnits, si_unit, to_si, unit_system
 from data_schema.validation import Violation, validate
 
 __all__ = [
@@ -27,8 +29,12 @@ __all__ = [
     "UnknownUnits",
     "Variable",
     "Violation",
+    "dataset_checksum",
+    "digests_of_run",
     "fields",
     "parameters",
+    "run_checksum",
+    "si_unit",
     "to_si",
     "unit_system",
     "validate",

@@ -7,6 +7,7 @@ faces between them. Displacements are measured from the reference position, so `
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -27,6 +28,7 @@ DIMENSIONS: Mapping[str, str] = MappingProxyType(
         "cell": "one solid or beam, kept beside the faces",
         "cell_corner": "corner of a cell",
         "source_state": "one output state of a run before the runs were brought to a common time",
+        "tensor": "the components xx, yy, zz, xy, yz, zx of a symmetric tensor",
     }
 )
 
@@ -102,6 +104,20 @@ VARIABLES: Mapping[str, Variable] = MappingProxyType(
             _variable("cell_part", "cell", kind="i", unit="1", meaning="index of the cell's part in `part`"),
             _variable("cell_id", "cell", kind="i", unit="1", meaning="the solver's element number"),
             _variable("alive", "sim time face", kind="b", unit="", meaning="False once the element has eroded"),
+            _variable("cell_alive", "sim time cell", kind="b", unit="", meaning="the same for solids and beams"),
+            _variable(
+                "mesh", "", kind="i", unit="", meaning="no value; its attributes tell UGRID readers where the mesh is"
+            ),
+            *(
+                _variable(
+                    f"node_{axis}",
+                    "node",
+                    kind="f",
+                    unit="m",
+                    meaning=f"{axis} of reference_position (of the first run where runs differ), for UGRID readers",
+                )
+                for axis in "xyz"
+            ),
             _variable(
                 "source_time",
                 "sim source_state",
@@ -116,7 +132,13 @@ VARIABLES: Mapping[str, Variable] = MappingProxyType(
                 unit="m",
                 meaning="estimated largest node displacement error that the change to the common time made",
             ),
-            _variable("run_checksum", "sim", kind="U", unit="", meaning="SHA-256 of the run's values as written"),
+            _variable(
+                "run_checksum",
+                "sim",
+                kind="U",
+                unit="",
+                meaning="SHA-256 of the run's results, as `data_schema.checksum` takes it",
+            ),
             _variable("complete", "sim", kind="b", unit="", meaning="every state was found and the end time reached"),
         )
     }
@@ -142,7 +164,9 @@ ATTRIBUTES: Mapping[str, Attribute] = MappingProxyType(
             Attribute("units_read", "the unit system of the source, such as mm-ms-kg"),
             Attribute("units_written", '"SI"'),
             Attribute("crashkit_version", "the version that wrote the dataset"),
-            Attribute("history", "one line for every change: time, command"),
+            Attribute("history", "one line for every change: the version and what it did"),
+            Attribute("checksum", "SHA-256 of the content, as `data_schema.checksum` takes it", required=False),
+            Attribute("parameters", "JSON list: names of the design parameters in their order", required=False),
             Attribute("title", "a name for people", required=False),
         )
     }
@@ -150,8 +174,16 @@ ATTRIBUTES: Mapping[str, Attribute] = MappingProxyType(
 
 
 def parameters(dataset: xr.Dataset) -> list[str]:
-    """Names of the design parameters: the variables on `sim` with attribute `role: parameter`, in file order."""
-    return [str(n) for n, v in dataset.data_vars.items() if v.attrs.get("role") == "parameter"]
+    """Names of the design parameters: the variables on `sim` with attribute `role: parameter`.
+
+    They come in the order of the attribute `parameters`, and of the file where that says nothing.
+    """
+    found = [str(n) for n, v in dataset.data_vars.items() if v.attrs.get("role") == "parameter"]
+    try:
+        order = [str(n) for n in json.loads(dataset.attrs.get("parameters", "[]"))]
+    except (TypeError, ValueError):
+        order = []
+    return sorted(found, key=lambda name: order.index(name) if name in order else len(order))
 
 
 def fields(dataset: xr.Dataset) -> list[str]:

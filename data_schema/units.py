@@ -13,19 +13,20 @@ _LENGTH = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
 _TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 _MASS = {"kg": 1.0, "g": 1e-3, "t": 1e3, "ton": 1e3}
 
-# Exponents of (length, time, mass) of the quantities that crash results carry.
+# Exponents of (length, time, mass) of the quantities that crash results carry, and their SI unit.
 _QUANTITIES = MappingProxyType(
     {
-        "length": (1, 0, 0),
-        "time": (0, 1, 0),
-        "mass": (0, 0, 1),
-        "velocity": (1, -1, 0),
-        "acceleration": (1, -2, 0),
-        "force": (1, -2, 1),
-        "stress": (-1, -2, 1),
-        "energy": (2, -2, 1),
-        "density": (-3, 0, 1),
-        "one": (0, 0, 0),
+        "length": ((1, 0, 0), "m"),
+        "time": ((0, 1, 0), "s"),
+        "mass": ((0, 0, 1), "kg"),
+        "velocity": ((1, -1, 0), "m s-1"),
+        "acceleration": ((1, -2, 0), "m s-2"),
+        "force": ((1, -2, 1), "N"),
+        "stress": ((-1, -2, 1), "Pa"),
+        "energy": ((2, -2, 1), "J"),
+        "density": ((-3, 0, 1), "kg m-3"),
+        "one/time": ((0, -1, 0), "s-1"),
+        "one": ((0, 0, 0), "1"),
     }
 )
 
@@ -45,10 +46,19 @@ class UnitSystem:
 
     def factor(self, quantity: str) -> float:
         """SI value of one unit of `quantity` ("length", "velocity", "stress", ...) in this system."""
-        if quantity not in _QUANTITIES:
-            raise UnknownUnits(f"quantity {quantity!r} is not known; known are {', '.join(_QUANTITIES)}")
-        length, time, mass = _QUANTITIES[quantity]
+        length, time, mass = _quantity(quantity)[0]
         return self.length**length * self.time**time * self.mass**mass
+
+
+def si_unit(quantity: str) -> str:
+    """CF unit string of `quantity` in SI, such as "m s-1" for "velocity"."""
+    return _quantity(quantity)[1]
+
+
+def _quantity(name: str) -> tuple[tuple[int, int, int], str]:
+    if name not in _QUANTITIES:
+        raise UnknownUnits(f"quantity {name!r} is not known; known are {', '.join(_QUANTITIES)}")
+    return _QUANTITIES[name]
 
 
 def unit_system(name: str) -> UnitSystem:

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
+from data_schema.checksum import ArrayDigest, dataset_checksum, result_blocks, results, run_checksum
 from data_schema.layout import ATTRIBUTES, CONVENTIONS, VARIABLES, fields, parameters
 
 # A displacement of the first state below this many metres is rounding of single precision positions.
@@ -31,7 +33,8 @@ def validate(dataset: xr.Dataset, *, values: bool = True) -> list[Violation]:
     """Every violation of the crash dataset layout; an empty list means the dataset is good.
 
     `values=False` looks at names, dimensions, types, units and attributes only and reads no displacement.
-    With values, displacements are read one run at a time, so memory stays at one run.
+    With values, results are read once, a block of nodes of one run at a time, so memory stays small; the checksums
+    written at ingest are taken again on the way.
     """
     structural = [v for rule in _STRUCTURE for v in rule(dataset)]
     if structural or not values:
@@ -62,9 +65,11 @@ def _sizes(dataset: xr.Dataset) -> Iterator[Violation]:
             yield Violation(f"dimension {name}", str(dataset.sizes[name]), str(size))
     if "corner" in dataset.sizes and dataset.sizes["corner"] not in (3, 4):
         yield Violation("dimension corner", str(dataset.sizes["corner"]), "3 or 4")
-    for name in ("sim", "time", "node", "face"):
+    for name in ("sim", "time", "node"):
         if dataset.sizes.get(name) == 0:
             yield Violation(f"dimension {name}", "0", "at least 1")
+    if dataset.sizes.get("face") == 0 and not dataset.sizes.get("cell"):
+        yield Violation("dimension face", "0", "at least 1, or solids and beams")
 
 
 def _attributes(dataset: xr.Dataset) -> Iterator[Violation]:
@@ -148,43 +153,94 @@ def _completeness(dataset: xr.Dataset) -> Iterator[Violation]:
             yield Violation(f"run {run}", "an incomplete run", "every state up to the end time")
 
 
-def _displacement(dataset: xr.Dataset) -> Iterator[Violation]:
+def _results(dataset: xr.Dataset) -> Iterator[Violation]:
+    """Values of every run and, where they were recorded, the checksums of what was written."""
+    recorded = dataset["run_checksum"].values if "run_checksum" in dataset else None
     for k, run in enumerate(dataset["sim"].values):
-        u = dataset["displacement"].isel(sim=k).values
-        where = f"displacement, run {run}"
-        gone = _gone(dataset, k, u.shape[:2])
-        bad = ~np.isfinite(u).all(axis=-1)
-        if (bad & ~gone).any():
-            state, node = np.argwhere(bad & ~gone)[0]
+        digests = {}
+        for name in results(dataset):
+            digest = ArrayDigest(dataset[name].dtype)
+            checks = _DisplacementChecks(dataset, k) if name == "displacement" else None
+            for first, _, block in result_blocks(dataset[name].isel(sim=k)):
+                digest.update(block)
+                if checks:
+                    checks.look_at(first, block)
+            if digest.says_something:
+                digests[name] = digest.hexdigest()
+            if checks:
+                yield from checks.violations(f"displacement, run {run}")
+        if recorded is not None and str(recorded[k]) != run_checksum(digests):
+            yield Violation(
+                f"results, run {run}",
+                f"content with SHA-256 {run_checksum(digests)[:12]}...",
+                f"{str(recorded[k])[:12]}... as it was written: the file is damaged, or its values were changed",
+            )
+    whole = dataset.attrs.get("checksum")
+    written = {entry["run"] for entry in json.loads(dataset.attrs["source_files"])}
+    is_whole = written == set(map(str, dataset["sim"].values))  # and not some runs of a larger dataset
+    if recorded is not None and whole and is_whole and dataset_checksum(dataset, map(str, recorded)) != whole:
+        yield Violation(
+            "attribute checksum", f"{str(whole)[:12]}...", "the SHA-256 of mesh, times, parameters and runs as they are"
+        )
+
+
+class _DisplacementChecks:
+    """What must hold for the displacement of one run, gathered over blocks (time, nodes of the block, 3)."""
+
+    def __init__(self, dataset: xr.Dataset, sim: int) -> None:
+        self._gone = _gone(dataset, sim, (dataset.sizes["time"], dataset.sizes["node"]))
+        self._first_bad: tuple[int, int] | None = None
+        self._first_undead: tuple[int, int] | None = None
+        self._start = 0.0
+        self._moves = dataset.sizes["time"] == 1
+
+    def look_at(self, first: int, block: NDArray) -> None:
+        bad = ~np.isfinite(block).all(axis=-1)
+        gone = self._gone[:, first : first + block.shape[1]]
+        self._first_bad = _first(bad & ~gone, first, self._first_bad)
+        self._first_undead = _first(~bad & gone, first, self._first_undead)
+        self._start = max(self._start, float(np.abs(block[0][~bad[0]]).max(initial=0.0)))
+        self._moves = self._moves or bool(((block != 0) & ~bad[..., None]).any())
+
+    def violations(self, where: str) -> Iterator[Violation]:
+        if self._first_bad:
+            state, node = self._first_bad
             yield Violation(f"{where}, state {state}, node {node}", "a value that is not finite", "a number")
-        if (~bad & gone).any():
-            state, node = np.argwhere(~bad & gone)[0]
+        if self._first_undead:
+            state, node = self._first_undead
             yield Violation(f"{where}, state {state}, node {node}", "a number", "NaN: all its elements are gone")
-        largest = float(np.abs(np.where(bad[0, :, None], 0, u[0])).max(initial=0.0))
-        if largest > FIRST_STATE_TOLERANCE:
-            yield Violation(f"{where}, first state", f"up to {largest:.3g} m", "zero: it is the reference")
-        if u.shape[0] > 1 and not np.nan_to_num(u).any():
+        if self._start > FIRST_STATE_TOLERANCE:
+            yield Violation(f"{where}, first state", f"up to {self._start:.3g} m", "zero: it is the reference")
+        if not self._moves:
             yield Violation(where, "zero everywhere in every state", "a structure that moves")
 
 
-def _gone(dataset: xr.Dataset, sim: int, shape: tuple[int, ...]) -> np.ndarray:
+def _first(wrong: NDArray[np.bool_], offset: int, known: tuple[int, int] | None) -> tuple[int, int] | None:
+    """Place (state, node) of the first True, or the one known before."""
+    if known is not None or not wrong.any():
+        return known
+    state, node = np.argwhere(wrong)[0]
+    return int(state), int(node) + offset
+
+
+def _gone(dataset: xr.Dataset, sim: int, shape: tuple[int, int]) -> NDArray[np.bool_]:
     """(time, node) bool: nodes that had elements once and have no living one now."""
     gone = np.zeros(shape, bool)
-    if "alive" not in dataset:
+    kinds = [
+        (dataset[nodes].values, dataset[alive].isel(sim=sim).values if alive in dataset else None)
+        for nodes, alive in (("face_nodes", "alive"), ("cell_nodes", "cell_alive"))
+        if nodes in dataset
+    ]
+    if all(alive is None for _, alive in kinds):
         return gone
-    alive = dataset["alive"].isel(sim=sim).values
-    corners = dataset["face_nodes"].values
-    valid = corners >= 0
     used = np.zeros(shape[1], bool)
-    used[corners[valid]] = True
-    if "cell_nodes" in dataset:  # a node held by a solid or beam outlives its shells
-        cells = dataset["cell_nodes"].values
-        beside = np.zeros(shape[1], bool)
-        beside[cells[cells >= 0]] = True
-        used &= ~beside
+    for corners, _ in kinds:
+        used[corners[corners >= 0]] = True
     for state in range(shape[0]):
         living = np.zeros(shape[1], bool)
-        living[corners[alive[state]][valid[alive[state]]]] = True
+        for corners, alive in kinds:
+            there = corners if alive is None else corners[alive[state]]
+            living[there[there >= 0]] = True
         gone[state] = used & ~living
     return gone
 
@@ -196,5 +252,5 @@ def _dims(dims: tuple[str, ...] | tuple[object, ...]) -> str:
 _Rule = Callable[[xr.Dataset], Iterator[Violation]]
 _STRUCTURE: tuple[_Rule, ...] = (_variables, _sizes, _attributes, _roles)
 _VALUES: tuple[_Rule, ...] = (
-    _time, _unique, _indices, _reference, _parameter_values, _completeness, _displacement,
+    _time, _unique, _indices, _reference, _parameter_values, _completeness, _results,
 )  # fmt: skip

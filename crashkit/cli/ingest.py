@@ -7,7 +7,10 @@ from typing import Annotated
 
 import typer
 
-from crashkit.cli._console import print_json, progress, say
+from crashkit.cli._console import fail, print_json, progress, say, table
+
+# Where no progress bar can be shown.
+_SECONDS_BETWEEN_LINES = 10
 
 
 def command(
@@ -19,6 +22,9 @@ def command(
     units: Annotated[str | None, typer.Option(help="Unit system of the source: SI, mm-ms-kg, mm-s-t, ...")] = None,
     reader: Annotated[str | None, typer.Option(help="Source format, where it shall not be told by content.")] = None,
     mesh: Annotated[Path | None, typer.Option(help="Mesh file with the faces, where the source has none.")] = None,
+    names: Annotated[
+        str, typer.Option(help="Names of the runs, from {run} and {source}, such as {source}-{run}.")
+    ] = "{run}",
     parts: Annotated[str, typer.Option(help="Only these parts: numbers, titles or patterns, with commas.")] = "",
     exclude_parts: Annotated[str, typer.Option(help="Without these parts.")] = "",
     keep_rigid_walls: Annotated[
@@ -43,50 +49,59 @@ def command(
 
     Interrupted or killed, the same command goes on where it was. New runs are appended to an existing dataset.
     """
+    from dataclasses import asdict
+    from time import monotonic
+
     from crashkit.ingest import ingest
 
     if on_error not in ("stop", "skip"):
         raise typer.BadParameter(f"{on_error!r}; expected stop or skip", param_hint="--on-error")
     with progress(quiet=json) as bar:
         task = bar.add_task("ingest", total=None, note="")
+        last = monotonic()
 
         def tell(done: int, total: int, note: str) -> None:
+            nonlocal last
             bar.update(task, completed=done, total=total or None, note=note)
+            if bar.disable and not json and monotonic() - last > _SECONDS_BETWEEN_LINES:
+                last = monotonic()
+                say(f"{done} of {total or '?'} runs, {note}")
 
-        summary = ingest(
-            list(sources),
-            output,
-            params=params,
-            units=units,
-            reader=reader,
-            reader_options={"mesh": mesh} if mesh else None,
-            parts=_list(parts),
-            exclude_parts=_list(exclude_parts),
-            keep_rigid_walls=keep_rigid_walls,
-            fields=_list(fields),
-            time=_times(time),
-            on_error="skip" if on_error == "skip" else "stop",
-            allow_incomplete=allow_incomplete,
-            overwrite=overwrite,
-            workers=workers,
-            scheduler=scheduler,
-            progress=tell,
-        )
+        try:
+            summary = ingest(
+                sources, output, params=params, units=units, reader=reader, mesh=mesh, names=names,
+                parts=_list(parts), exclude_parts=_list(exclude_parts), keep_rigid_walls=keep_rigid_walls,
+                fields=_list(fields), time=_times(time), on_error="skip" if on_error == "skip" else "stop",
+                allow_incomplete=allow_incomplete, overwrite=overwrite, workers=workers, scheduler=scheduler,
+                progress=tell,
+            )  # fmt: skip
+        except KeyboardInterrupt:
+            partial = output.with_name(output.name + ".partial")
+            kept = f"; finished runs are kept in {partial}, the same command goes on from there"
+            fail(f"interrupted{kept if partial.exists() else ''}", code=130)
     if json:
-        print_json(summary.__dict__)
+        print_json(asdict(summary))
         return
     for note in summary.notes:
         say(f"  {note}")
     for run, reason in summary.skipped.items():
         say(f"  skipped {run}: {reason}")
-    worst = max(summary.alignment_error, key=lambda r: summary.alignment_error[r], default=None)
-    if worst is not None and summary.alignment_error[worst] > 0:
-        say(
-            f"  brought to common times; largest estimated error {summary.alignment_error[worst] * 100:.3g} cm (run {worst})"
+    errors = summary.alignment_error
+    if any(errors.values()):
+        table(
+            "Runs brought to common times",
+            ("run", "estimated error (mm)"),
+            [(run, f"{1e3 * error:.3g}") for run, error in errors.items() if error > 0],
         )
-    say(
-        f"{summary.output}: {len(summary.runs)} runs, {len(summary.written)} of them new, {len(summary.skipped)} skipped"
-    )
+    counts = [
+        (len(summary.added), "new"),
+        (len(summary.replaced), "replaced"),
+        (len(summary.unchanged), "unchanged"),
+        (len(summary.skipped), "skipped"),
+    ]
+    told = ", ".join(f"{count} {what}" for count, what in counts if count)
+    resumed = f"; {summary.resumed} were read by an earlier start" if summary.resumed else ""
+    say(f"{summary.output}: {len(summary.runs)} runs ({told}{resumed}), {summary.states} states, {summary.nodes} nodes")
 
 
 def _list(text: str) -> list[str]:

@@ -1,0 +1,394 @@
+"""The first look at every run, before anything large is read: can it be used, and what do all runs share?
+
+A run is refused here, by name and with the place in its file, if it is incomplete, has times that do not increase,
+no known units, another mesh than the runs before it, or lacks a parameter. What the values hold is checked when they
+are read (`crashkit.transfer`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crashkit.errors import CrashkitError, DataError, ReadError
+from crashkit.parameter_table import read_parameter_table
+from crashkit.readers import reader_for
+from crashkit.readers.base import FieldInfo, Run
+from crashkit.structure import Structure, matched, structure_of
+from data_schema import DIMENSIONS, VARIABLES, to_si, unit_system
+from data_schema.units import UnknownUnits, si_unit
+
+# Reference positions closer than this fraction of the structure's size are the same: files keep seven digits.
+SAME_SHAPE = 1e-6
+# A run may end this many of its output steps before the end that was asked for: solvers stop on a time step.
+_MISSING_STEPS = 1.5
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What of each run is wanted, and how it is to be understood; the options of `ingest` that decide the content.
+
+    names   how runs are called in the dataset, from `{run}` (as its source calls it) and `{source}` (file or folder)
+    """
+
+    units: str | None = None
+    parts: tuple[str, ...] = ()
+    exclude_parts: tuple[str, ...] = ()
+    keep_rigid_walls: bool = False
+    fields: tuple[str, ...] = ()
+    allow_incomplete: bool = False
+    names: str = "{run}"
+    reader: str | None = None
+    reader_options: tuple[tuple[str, str], ...] = ()
+
+    def structure(self, run: Run) -> Structure:
+        """The chosen structure of a run."""
+        return structure_of(
+            run.mesh,
+            parts=self.parts,
+            exclude_parts=self.exclude_parts,
+            keep_rigid_walls=self.keep_rigid_walls,
+        )
+
+
+@dataclass(frozen=True)
+class Field:
+    """A result field as it goes into the dataset: `info` says where it lies; `unit` is "unknown" where nobody says."""
+
+    info: FieldInfo
+    unit: str
+
+
+@dataclass(frozen=True)
+class Found:
+    """One run that can be used; small enough to send to a worker.
+
+    time        (state,) s, its own output times
+    parameters  name -> (value, unit), in the dataset's units
+    fields      the wanted fields that it has
+    """
+
+    source: Path
+    index: int
+    name: str
+    solver: str
+    units: str
+    time: NDArray[np.float64]
+    parameters: Mapping[str, tuple[float, str]]
+    fields: Mapping[str, Field]
+    files: tuple[Path, ...]
+    end_time: float | None
+    complete: bool
+
+
+@dataclass
+class Survey:
+    """What was found. `structure` is that of the first run (or of the dataset appended to), in metres."""
+
+    found: list[Found] = field(default_factory=list)
+    skipped: dict[str, str] = field(default_factory=dict)
+    structure: Structure | None = None
+    one_shape: bool = True
+    notes: list[str] = field(default_factory=list)
+
+    def note(self, text: str) -> None:
+        if text not in self.notes:
+            self.notes.append(text)
+
+    def refuse(self, run: str, error: CrashkitError, stop: bool) -> None:
+        """Skip a run and remember why, or give up."""
+        if stop:
+            raise type(error)(f"run {run}: {error}") from error
+        self.skipped[run] = str(error)
+
+
+def survey(
+    sources: Sequence[Path],
+    choice: Choice,
+    *,
+    params: Path | None = None,
+    time: NDArray[np.float64] | None = None,
+    structure: Structure | None = None,
+    stop: bool = True,
+    tell: Callable[[str], None] = lambda note: None,
+) -> Survey:
+    """Look at all runs in `sources`.
+
+    params     table of design parameters; its values go before those of the source
+    time       the common times asked for, if any: a run needs to reach no further
+    structure  of the dataset the runs shall join; None for a new one
+    stop       raise at the first run that cannot be used; else it is skipped, with its reason
+
+    Raises CrashkitError for what concerns all runs (unknown format, unreadable table, a field nobody has).
+    """
+    table = read_parameter_table(params) if params is not None else None
+    out = Survey(structure=structure)
+    for source in sources:
+        for index, name, run in each_run(source, choice, out, stop):
+            tell(name)
+            try:
+                found = _look(run, name, source, index, choice, out)
+                if table is not None:
+                    found = replace(found, parameters=_from_table(found, table.row(name), out, table.path))
+                out.found.append(_same_parameters(found, out))
+            except CrashkitError as error:
+                out.refuse(name, error, stop)
+            finally:
+                run.close()
+    if table is not None:
+        unused = [r for r in table.rows if r not in {f.name for f in out.found} | set(out.skipped)]
+        if unused:
+            out.note(f"{table.path}: {_listed(unused)} in the table, but no such run was given")
+    _refuse_short(out, choice, time, stop)
+    if not out.found:
+        reasons = "; ".join(f"{run}: {reason}" for run, reason in out.skipped.items())
+        raise DataError(f"no run can be used ({reasons or 'the sources hold none'})")
+    for name in choice.fields:
+        _note_missing(name, out)
+    return out
+
+
+def each_run(source: Path, choice: Choice, out: Survey, stop: bool) -> Iterator[tuple[int, str, Run]]:
+    """(place in the source, name in the dataset, run); runs that cannot be opened are refused."""
+    reader = reader_for(source, choice.reader)
+    runs = reader.runs(source, **dict(choice.reader_options))
+    index = -1
+    while True:
+        index += 1
+        try:
+            run = next(runs, None)
+        except ReadError as error:
+            if stop:
+                raise
+            out.skipped[f"{source.name}, run {index + 1}"] = str(error)
+            continue
+        if run is None:
+            if index == 0:
+                raise ReadError(f"{source}: holds no run")
+            return
+        yield index, _named(run, source, choice.names), run
+
+
+def reopen(found: Found, choice: Choice) -> Run:
+    """The run `found`, opened again where it was found."""
+    runs = reader_for(found.source, choice.reader).runs(found.source, **dict(choice.reader_options))
+    pass_over(runs, found.index)
+    run = next(runs, None)
+    if run is None or _named(run, found.source, choice.names) != found.name or len(run.time) != len(found.time):
+        raise ReadError(f"{found.source}: run {found.name} has changed since it was first looked at; start again")
+    return run
+
+
+def pass_over(runs: Iterator[Run], count: int) -> None:
+    """Leave out the next `count` runs, without opening them where the iterator knows how (`skip`)."""
+    if hasattr(runs, "skip"):
+        runs.skip(count)
+        return
+    for _ in range(count):
+        try:
+            run = next(runs, None)
+        except ReadError:
+            continue
+        if run is not None:
+            run.close()
+
+
+def wanted_field(run: Run, name: str, units: str) -> Field | None:
+    """The field `name` as the dataset keeps it, or None if the run has nothing of the kind.
+
+    A field of shells also covers the skin of solids, with the values of the solid behind a face: `plastic_strain`
+    takes in `solid_plastic_strain`, which can be asked for on all cells as well.
+    """
+    info = run.fields.get(name)
+    if info is None:
+        behind = cell_fields(run, name)
+        if not behind:
+            return None
+        info = replace(run.fields[behind[0]], name=name, location="face")
+    try:
+        unit_system(units).factor(info.quantity)
+        return Field(info, si_unit(info.quantity))
+    except UnknownUnits:
+        return Field(info, "unknown")
+
+
+def cell_fields(run: Run, name: str) -> list[str]:
+    """Fields of solids, thick shells, ... that mean the same as the shell field `name`."""
+    return [n for n, info in run.fields.items() if info.location == "cell" and n.endswith(f"_{name}")]
+
+
+def _named(run: Run, source: Path, pattern: str) -> str:
+    try:
+        return pattern.format(run=run.name, source=source.resolve().name.split(".")[0])
+    except (KeyError, IndexError, ValueError) as error:
+        raise DataError(
+            f"names {pattern!r} not understood ({error}); expected text with {{run}} and {{source}}"
+        ) from error
+
+
+def _look(run: Run, name: str, source: Path, index: int, choice: Choice, out: Survey) -> Found:
+    if any(f.name == name for f in out.found):
+        raise DataError(
+            f"{source}: a run of this name was given already; rename its folder or file, or tell them apart with "
+            "--names '{source}-{run}'"
+        )
+    units = _units(run, source, choice, out)
+    time = np.asarray(run.time, np.float64)
+    _check_time(time, source)
+    problems = [*run.problems, *_ends_early(run, time, source)]
+    if problems and not choice.allow_incomplete:
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        raise DataError(f"{problems[0]}{more}; mend the run, or take it as it is with --allow-incomplete")
+    for problem in problems:
+        out.note(f"run {name} is incomplete: {problem}")
+    system = unit_system(units)
+    structure = choice.structure(run)
+    structure = replace(structure, position=structure.position * system.length)
+    if not np.isfinite(structure.position).all():
+        node = int(np.argmin(np.isfinite(structure.position).all(axis=1)))
+        raise DataError(f"{source}: node {structure.node_id[node]} has an undeformed position that is no number")
+    for text in structure.notes:
+        out.note(text)
+    if out.structure is None:
+        out.structure = structure
+    else:
+        structure = matched(out.structure, structure)
+        size = float(np.ptp(out.structure.position, axis=0).max(initial=0.0))
+        out.one_shape &= bool(np.abs(structure.position - out.structure.position).max(initial=0.0) <= SAME_SHAPE * size)
+    fields = {n: f for n in choice.fields if (f := wanted_field(run, n, units)) is not None}
+    missing = [n for n in choice.fields if n not in fields]
+    if missing:
+        out.note(f"run {name} has no {', '.join(missing)}; it has {', '.join(run.fields) or 'no further field'}")
+    return Found(
+        source=source,
+        index=index,
+        name=name,
+        solver=run.solver,
+        units=units,
+        time=time * system.time,
+        parameters=_in_dataset_units({k: (p.value, p.unit) for k, p in run.parameters.items()}, source),
+        fields=fields,
+        files=tuple(run.files),
+        end_time=None if run.end_time is None else run.end_time * system.time,
+        complete=not problems,
+    )
+
+
+def _units(run: Run, source: Path, choice: Choice, out: Survey) -> str:
+    name = choice.units or run.units
+    if name is None:
+        raise DataError(f"{source}: its files state no units; say them, for example --units mm-ms-kg or --units SI")
+    try:
+        unit_system(name)
+    except UnknownUnits as error:
+        raise DataError(str(error)) from error
+    if choice.units and run.units and choice.units != run.units:
+        out.note(f"{source}: states the units {run.units}; read in {choice.units} as asked for")
+    return name
+
+
+def _check_time(time: NDArray[np.float64], source: Path) -> None:
+    if len(time) == 0:
+        raise DataError(f"{source}: holds no state")
+    wrong = ~np.isfinite(time)
+    wrong[1:] |= np.diff(time) <= 0
+    if wrong.any():
+        k = int(np.argmax(wrong))
+        before = f", the one before {time[k - 1]:g}" if k else ""
+        raise DataError(f"{source}: state {k} has time {time[k]:g}{before}; expected increasing times")
+
+
+def _ends_early(run: Run, time: NDArray[np.float64], source: Path) -> list[str]:
+    if run.end_time is None:
+        return []
+    step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    if time[-1] >= run.end_time - _MISSING_STEPS * step:
+        return []
+    return [f"{source}: ends at time {time[-1]:g}, its control data asks for {run.end_time:g}"]
+
+
+def _refuse_short(out: Survey, choice: Choice, time: NDArray[np.float64] | None, stop: bool) -> None:
+    """Runs whose source states no end time must reach as far as the others do."""
+    whole = [f for f in out.found if f.complete and len(f.time) > 1]
+    if len(whole) < 2:
+        return
+    latest = max(whole, key=lambda f: float(f.time[-1]))
+    goal = float(latest.time[-1]) if time is None else min(float(time[-1]), float(latest.time[-1]))
+    for place, found in enumerate(out.found):
+        short = (
+            found.time[-1] < goal - _MISSING_STEPS * float(np.median(np.diff(found.time))) if found in whole else False
+        )
+        if not short or found.end_time is not None:
+            continue
+        problem = f"{found.source}: ends at {found.time[-1]:g} s, run {latest.name} at {latest.time[-1]:g} s"
+        if choice.allow_incomplete:
+            out.note(f"run {found.name} is incomplete: {problem}")
+            out.found[place] = replace(found, complete=False)
+        else:
+            error = DataError(f"{problem}; mend the run, or take it as it is with --allow-incomplete")
+            out.refuse(found.name, error, stop)
+    out.found = [f for f in out.found if f.name not in out.skipped]
+
+
+def _in_dataset_units(values: Mapping[str, tuple[float, str]], place: Any) -> dict[str, tuple[float, str]]:
+    out = {}
+    for name, (value, unit) in values.items():
+        if name in VARIABLES or name in DIMENSIONS:
+            raise DataError(f"{place}: a parameter cannot be called {name!r}, which means something else; rename it")
+        factor, si = to_si(unit)
+        if not np.isfinite(value):
+            raise DataError(f"{place}: parameter {name} is {value}; expected a number")
+        out[name] = (value * factor, si)
+    return out
+
+
+def _from_table(
+    found: Found, row: Mapping[str, tuple[float, str]], out: Survey, path: Path
+) -> dict[str, tuple[float, str]]:
+    """Parameters of a run with those of its row, which go before the source's."""
+    values = _in_dataset_units(row, path)
+    both = [n for n in values if n in found.parameters and found.parameters[n] != values[n]]
+    if both:
+        out.note(f"{path}: {', '.join(both)} of the table taken instead of the source's own")
+    for name, (_, unit) in row.items():
+        if not unit:
+            out.note(f"{path}: {name} has no unit and is taken for a plain number; name it as {name} [unit]")
+    return {**found.parameters, **values}
+
+
+def _same_parameters(found: Found, out: Survey) -> Found:
+    """`found`, if it has the parameters of the first run, in the same units."""
+    if not out.found:
+        return found
+    first = out.found[0]
+    mine, theirs = ({n: u for n, (_, u) in f.parameters.items()} for f in (found, first))
+    if mine != theirs:
+        raise DataError(
+            f"{found.source}: has the parameters {described(mine)}, run {first.name} has {described(theirs)}; "
+            "expected the same in all runs"
+        )
+    return replace(found, parameters={n: found.parameters[n] for n in first.parameters})
+
+
+def described(parameters: Mapping[str, str]) -> str:
+    """Names with units, such as "impact_speed [m s-1]"."""
+    return ", ".join(f"{n} [{u}]" for n, u in parameters.items()) or "none"
+
+
+def _note_missing(name: str, out: Survey) -> None:
+    infos = {f.fields[name] for f in out.found if name in f.fields}
+    if not infos:
+        told = next((n for n in out.notes if f"has no {name}" in n or f", {name}" in n), "")
+        raise DataError(f"no run has a field {name!r}; {told or 'ask for another with --fields'}")
+    if len(infos) > 1:
+        raise DataError(f"field {name!r} lies elsewhere or has another unit in some runs; leave it out of --fields")
+
+
+def _listed(names: Sequence[str], most: int = 5) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return f"run{'s' if len(names) > 1 else ''} {', '.join(names[:most])}{more}"

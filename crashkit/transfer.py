@@ -1,0 +1,284 @@
+"""One run from its source into the staging folder: read by states, checked, changed to SI and to the common times,
+written by blocks of nodes.
+
+A reader gives some states of all nodes; a chunk holds all states of some nodes. The turn is made in memory while a
+run stays below `MEMORY_BYTES`, and through a scratch file where it does not, so memory does not grow with the run.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crashkit.alignment import flags_at, interpolate, interpolation_error, same_time
+from crashkit.errors import DataError
+from crashkit.readers.base import Run, split_states
+from crashkit.run_view import Flags, RunView, gone_nodes
+from crashkit.staging import StagedRun
+from crashkit.store import ArraySpec, create_arrays
+from crashkit.structure import Structure, matched
+from crashkit.survey import Choice, Field, Found, reopen
+from data_schema import unit_system
+from data_schema.checksum import ArrayDigest
+from data_schema.validation import FIRST_STATE_TOLERANCE
+
+# A run's states are turned in memory up to this size, and read from the source in pieces of an eighth of it.
+MEMORY_BYTES = 256 << 20
+
+Block = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What all runs of the dataset share.
+
+    structure  in metres, its order of nodes, faces and cells is the dataset's
+    time       (state,) s
+    one_shape  whether all runs have the structure's reference positions
+    """
+
+    choice: Choice
+    structure: Structure
+    time: NDArray[np.float64]
+    fields: dict[str, Field]
+    one_shape: bool
+
+    def specs(self, *, alive: bool = True, cell_alive: bool = True) -> list[ArraySpec]:
+        """The result arrays of a run."""
+        states, s = len(self.time), self.structure
+        sizes = {"node": s.n_nodes, "face": len(s.face_nodes), "cell": len(s.cell_nodes)}
+        out = [
+            ArraySpec(
+                "displacement", ("time", "node", "xyz"), (states, s.n_nodes, 3), "float32",
+                {"units": "m", "long_name": "displacement from the reference position"},
+            )
+        ]  # fmt: skip
+        if not self.one_shape:
+            out.append(_reference_spec(s.n_nodes))
+        if alive:
+            out.append(ArraySpec("alive", ("time", "face"), (states, sizes["face"]), "bool"))
+        if cell_alive and sizes["cell"]:
+            out.append(ArraySpec("cell_alive", ("time", "cell"), (states, sizes["cell"]), "bool"))
+        for name, wanted in self.fields.items():
+            place, n = wanted.info.location, wanted.info.components
+            dims: tuple[str, ...] = ("time", place)
+            shape: tuple[int, ...] = (states, sizes[place])
+            if n > 1:
+                behind = {3: "xyz", 6: "tensor"}.get(n, f"{name}_component")
+                dims, shape = (*dims, behind), (*shape, n)
+            out.append(ArraySpec(name, dims, shape, "float32", {"units": wanted.unit, "role": "field"}))
+        return out
+
+
+def _reference_spec(nodes: int) -> ArraySpec:
+    return ArraySpec(
+        "reference_position", ("node", "xyz"), (nodes, 3), "float64", {"units": "m", "long_name": "undeformed position"}
+    )
+
+
+def transfer(found: Found, layout: Layout, key: str, place: Path) -> StagedRun:
+    """Read the run `found` and write its arrays into a Zarr store at `place`, whole or not at all.
+
+    Raises CrashkitError naming file, state and node of what is wrong, OSError if the disk is full.
+    """
+    beside = place.with_name(f"{place.name}.{os.getpid()}")
+    beside.parent.mkdir(exist_ok=True)
+    try:
+        run = reopen(found, layout.choice)
+        try:
+            digests, error = _Transfer(run, found, layout, beside).write()
+        finally:
+            run.close()
+        shutil.rmtree(place, ignore_errors=True)
+        (beside / "arrays").replace(place)
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+    return StagedRun(key, found.name, digests, error)
+
+
+class _Transfer:
+    """The work on one run."""
+
+    def __init__(self, run: Run, found: Found, layout: Layout, folder: Path) -> None:
+        self._found, self._layout = found, layout
+        structure = matched(layout.structure, layout.choice.structure(run))
+        self._view = RunView(run, structure, unit_system(found.units))
+        self._own, self._time = found.time, layout.time
+        self._aligned = same_time(self._own, self._time)
+        folder.mkdir()
+        self._scratch = folder / "scratch"
+        self._store = folder / "arrays"
+
+    def write(self) -> tuple[dict[str, str], float]:
+        """Digests of the arrays that say something, and the estimated error of the change of times."""
+        faces, cells = self._alive()
+        gone = gone_nodes(self._view.structure, faces, cells, len(self._time))
+        specs = {s.name: s for s in self._layout.specs(alive=faces is not None, cell_alive=cells is not None)}
+        absent = [n for n in self._layout.fields if n not in self._found.fields]
+        self._arrays = create_arrays(self._store, [s for n, s in specs.items() if n not in absent], 1)
+        digests: dict[str, str] = {}
+        error = self._displacement(specs["displacement"], gone, digests)
+        for name, flags in (("alive", faces), ("cell_alive", cells)):
+            if flags is not None:
+                self._put(specs[name], ((part, flags[:, part]) for part in _parts(specs[name])), digests)
+        for name, wanted in self._found.fields.items():
+            self._field(specs[name], wanted, digests)
+        if "reference_position" in specs:
+            self._arrays["reference_position"][0] = self._view.structure.position * self._view.system.length
+        return digests, error
+
+    # Displacements
+
+    def _displacement(self, spec: ArraySpec, gone: Flags | None, digests: dict[str, str]) -> float:
+        errors = [0.0]
+        with _Turn((len(self._own), *spec.shape[1:]), self._scratch) as turn:
+            for first, last in self._pieces(len(self._view.run.mesh.position) * 12):
+                values = self._view.displacement(first, last)
+                self._check(values, first)
+                turn.put(first, values)
+
+            def blocks() -> Iterator[tuple[slice, Block]]:
+                for part in _parts(spec):
+                    values = turn.nodes(part)
+                    if not self._aligned:
+                        errors.append(interpolation_error(values, self._own, self._time))
+                        values = interpolate(values, self._own, self._time)
+                    if gone is not None:
+                        values[gone[:, part]] = np.nan
+                    yield part, values
+
+            self._put(spec, blocks(), digests)
+        return max(errors)
+
+    def _check(self, values: Block, first: int) -> None:
+        """Refuse displacements (state, node, 3) that are no numbers on living nodes, or not zero in the first state."""
+        node_id = self._view.structure.node_id
+        if first == 0 and len(values):
+            size = np.abs(np.nan_to_num(values[0])).max(axis=-1)
+            node = int(size.argmax())
+            if size[node] > FIRST_STATE_TOLERANCE:
+                raise DataError(
+                    f"{self._file(0)}: in the first state (time {self._own[0]:g} s) node {node_id[node]} is displaced by "
+                    f"{size[node]:.3g} m; expected zero: are the first states missing, or are these positions and not "
+                    "displacements?"
+                )
+        if np.isfinite(values).all():
+            return
+        bad = ~np.isfinite(values).all(axis=-1)
+        gone = gone_nodes(self._view.structure, *self._view.alive(first, first + len(values)), len(values))
+        if gone is not None:
+            bad &= ~gone
+        if bad.any():
+            state, node = map(int, np.argwhere(bad)[0])
+            raise DataError(
+                f"{self._file(first + state)}: state {first + state} (time {self._own[first + state]:g} s), node "
+                f"{node_id[node]}: the displacement is {values[state, node].tolist()}; the solution diverged, or the "
+                "file is damaged"
+            )
+
+    def _file(self, state: int) -> str:
+        """The file that holds a state, as far as that can be told."""
+        files = self._found.files
+        return str(files[state] if len(files) >= len(self._own) > 1 else files[0] if files else self._found.source)
+
+    # Erosion
+
+    def _alive(self) -> tuple[Flags | None, Flags | None]:
+        """(state, face) and (state, cell) at the common times; None where nothing ever dies."""
+        found: list[Flags | None] = [None, None]
+        structure = self._view.structure
+        sizes = len(structure.face_nodes), len(structure.cell_nodes)
+        for first, last in self._pieces(sum(sizes)):
+            for k, flags in enumerate(self._view.alive(first, last)):
+                if flags is None or flags.all():
+                    continue
+                whole = found[k]
+                if whole is None:
+                    whole = found[k] = np.ones((len(self._own), sizes[k]), bool)
+                whole[first:last] = flags
+        if not self._aligned:
+            found = [None if f is None else flags_at(f, self._own, self._time) for f in found]
+        return found[0], found[1]
+
+    # Fields
+
+    def _field(self, spec: ArraySpec, wanted: Field, digests: dict[str, str]) -> None:
+        width = int(np.prod(spec.shape[2:], dtype=np.int64)) * 4
+        with _Turn((len(self._own), *spec.shape[1:]), self._scratch) as turn:
+            for first, last in self._pieces(self._view.field_rows(wanted) * width):
+                turn.put(first, self._view.field(wanted, first, last))
+
+            def blocks() -> Iterator[tuple[slice, Block]]:
+                for part in _parts(spec):
+                    values = turn.nodes(part)
+                    if not self._aligned:
+                        values = interpolate(values, self._own, self._time, cubic=False)
+                    yield part, values
+
+            self._put(spec, blocks(), digests)
+
+    # Writing
+
+    def _pieces(self, state_bytes: int) -> list[tuple[int, int]]:
+        """Ranges of own states whose values stay below an eighth of `MEMORY_BYTES`."""
+        return list(split_states(len(self._own), -(-state_bytes // 12), MEMORY_BYTES // 8))
+
+    def _put(self, spec: ArraySpec, blocks: Iterator[tuple[slice, Block]], digests: dict[str, str]) -> None:
+        digest = ArrayDigest(np.dtype(spec.dtype))
+        array = self._arrays[spec.name]
+        for part, values in blocks:
+            digest.update(values)
+            array[0, :, part] = values
+        if digest.says_something:
+            digests[spec.name] = digest.hexdigest()
+
+
+class _Turn:
+    """Values (state, node, ...) put in by states and taken out by nodes; in a file where they are many."""
+
+    def __init__(self, shape: tuple[int, ...], scratch: Path) -> None:
+        self._shape = shape
+        self._entry = int(np.prod(shape[2:], dtype=np.int64)) * 4
+        small = shape[0] * shape[1] * self._entry <= MEMORY_BYTES
+        self._values = np.empty(shape, np.float32) if small else None
+        self._scratch = scratch
+
+    def __enter__(self) -> _Turn:
+        self._file = None if self._values is not None else self._scratch.open("w+b", buffering=0)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._values = None
+        if self._file is not None:
+            self._file.close()
+            self._scratch.unlink()
+
+    def put(self, first: int, values: Block) -> None:
+        if self._values is not None:
+            self._values[first : first + len(values)] = values
+        elif self._file is not None:
+            self._file.seek(first * self._shape[1] * self._entry)
+            self._file.write(np.ascontiguousarray(values, np.float32).data.cast("B"))
+
+    def nodes(self, part: slice) -> Block:
+        """(state, nodes of `part`, ...) of all states; may be written to."""
+        if self._values is not None:
+            return np.array(self._values[:, part])
+        out = np.empty((self._shape[0], part.stop - part.start, *self._shape[2:]), np.float32)
+        for state in range(self._shape[0]):
+            if self._file is not None:
+                self._file.seek((state * self._shape[1] + part.start) * self._entry)
+                self._file.readinto(out[state].data.cast("B"))  # type: ignore[attr-defined]
+        return out
+
+
+def _parts(spec: ArraySpec) -> list[slice]:
+    step = spec.chunks[1]
+    return [slice(k, min(k + step, spec.shape[1])) for k in range(0, spec.shape[1], step)]

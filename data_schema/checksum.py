@@ -1,0 +1,122 @@
+"""What a dataset holds, as one SHA-256: the same for Zarr and NetCDF, any chunking and any number of workers.
+
+A run's own checksum covers its results (displacement, `alive`, fields); the dataset's covers these, the runs'
+names and parameters, and everything the runs share. Attributes are left out: they tell how, not what.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from data_schema.layout import fields, parameters
+
+# Results are stored and hashed in blocks of all states and some nodes (faces, cells), of about this many bytes.
+BLOCK_BYTES = 8 << 20
+
+
+def blocks(states: int, length: int, entry_bytes: int) -> list[tuple[int, int]]:
+    """Ranges first <= node < last of nearly equal size whose values of all states stay near `BLOCK_BYTES`.
+
+    `length` counts nodes (faces, cells), `entry_bytes` the bytes of one of them in one state. This is the chunking
+    of a dataset as well.
+    """
+    step = block_length(states, length, entry_bytes)
+    return [(k, min(k + step, length)) for k in range(0, length, step)]
+
+
+def block_length(states: int, length: int, entry_bytes: int) -> int:
+    """Nodes (faces, cells) in a block; at least 1."""
+    most = max(1, BLOCK_BYTES // max(1, states * entry_bytes))
+    count = max(1, -(-length // most))
+    return max(1, -(-length // count))
+
+
+class ArrayDigest:
+    """SHA-256 of one run's array (time, node, ...), fed with its blocks in order.
+
+    `says_something` stays False while all values are the default (True for bools, NaN for numbers): such an array
+    is as good as absent and left out of the run's checksum.
+    """
+
+    def __init__(self, dtype: np.dtype) -> None:
+        self._hash = hashlib.sha256()
+        self._dtype = np.dtype(dtype).newbyteorder("<")
+        self.says_something = False
+
+    def update(self, block: NDArray) -> None:
+        """Take one block (time, nodes of the block, ...)."""
+        plain = np.ascontiguousarray(block, dtype=self._dtype)
+        if not self.says_something:
+            default = plain.all() if plain.dtype.kind == "b" else np.isnan(plain).all()
+            self.says_something = not default
+        self._hash.update(plain.data)
+
+    def hexdigest(self) -> str:
+        return self._hash.hexdigest()
+
+
+def run_checksum(digests: Mapping[str, str]) -> str:
+    """SHA-256 of a run from the digests of its arrays by name."""
+    return _of(f"{name} {digests[name]}" for name in sorted(digests))
+
+
+def results(dataset: xr.Dataset) -> list[str]:
+    """Names of the variables that hold a run's results: displacement, alive, cell_alive and fields."""
+    return [n for n in ("displacement", "alive", "cell_alive", *fields(dataset)) if n in dataset.variables]
+
+
+def result_blocks(variable: xr.DataArray) -> Iterator[tuple[int, int, NDArray]]:
+    """(first, last, values (time, nodes, ...)) for one run's variable (time, node | face | cell, ...)."""
+    entry = variable.dtype.itemsize * int(np.prod(variable.shape[2:], dtype=np.int64))
+    for first, last in blocks(variable.shape[0], variable.shape[1], entry):
+        yield first, last, variable[:, first:last].values
+
+
+def digests_of_run(dataset: xr.Dataset, sim: int) -> dict[str, str]:
+    """Digest of each result array of run number `sim`, read block by block."""
+    out = {}
+    for name in results(dataset):
+        digest = ArrayDigest(dataset[name].dtype)
+        for _, _, block in result_blocks(dataset[name].isel(sim=sim)):
+            digest.update(block)
+        if digest.says_something:
+            out[name] = digest.hexdigest()
+    return out
+
+
+def dataset_checksum(
+    dataset: xr.Dataset,
+    run_checksums: Iterable[str],
+    positions: Callable[[int], NDArray] | None = None,
+) -> str:
+    """SHA-256 of a dataset whose runs have the given checksums, in their order; reads the small variables only.
+
+    `positions(run number)` gives (node, 3) float64, m, where the runs differ in shape and `dataset` is without them.
+    """
+    reference = dataset.get("reference_position")
+    if reference is not None and "sim" in reference.dims:
+        positions = lambda k: reference.isel(sim=k).values  # noqa: E731
+    shared = ["time", "node_id", "face_nodes", "face_part", "part_id", "cell_nodes", "cell_type"]
+    if positions is None:
+        shared.append("reference_position")
+    lines = [f"{name} {_array(dataset[name].values)}" for name in shared if name in dataset.variables]
+    names = sorted(parameters(dataset))
+    for k, (run, checksum) in enumerate(zip(dataset["sim"].values, run_checksums, strict=True)):
+        values = [f"{name}={float(dataset[name].values[k]).hex()}" for name in names]
+        shape = [_array(positions(k))] if positions is not None else []
+        lines.append(" ".join([str(run), *values, *shape, checksum]))
+    return _of(lines)
+
+
+def _array(values: NDArray) -> str:
+    plain = values.astype("<f8" if values.dtype.kind == "f" else "<i8")
+    return hashlib.sha256(np.ascontiguousarray(plain).tobytes()).hexdigest()
+
+
+def _of(lines: Iterable[str]) -> str:
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
