@@ -53,7 +53,10 @@ def solid_cells(nodes: NDArray[np.integer]) -> tuple[NDArray[np.int32], NDArray[
 
 
 def _collapsed(same: tuple[int, ...]) -> tuple[int, tuple[int, ...]]:
-    """VTK type and corners of a hexahedron whose corner k coincides with corner `same[k]`."""
+    """VTK type and corners of a hexahedron whose corner k coincides with corner `same[k]`.
+
+    VTK's tetrahedra, pyramids and wedges begin with a base that is seen counterclockwise from inside.
+    """
     whole = (HEXAHEDRON, tuple(range(8)))
     faces = []
     for face in _HEXAHEDRON_FACES:
@@ -70,9 +73,10 @@ def _collapsed(same: tuple[int, ...]) -> tuple[int, tuple[int, ...]]:
         return PYRAMID, (a, d, c, b, next(n for n in left if n not in quads[0]))
     if len(left) == 6 and len(triangles) == 2 and not set(triangles[0]) & set(triangles[1]):
         edges = {frozenset((f[k - 1], f[k])) for f in quads for k in range(4)}
-        top = [next((n for n in triangles[1] if frozenset((c, n)) in edges), None) for c in triangles[0]]
-        if None not in top:
-            return WEDGE, (*triangles[0], *(n for n in top if n is not None))
+        base = triangles[0][::-1]
+        top = [n for c in base for n in triangles[1] if frozenset((c, n)) in edges]
+        if len(top) == 3:
+            return WEDGE, (*base, *top)
     return whole
 
 

@@ -92,7 +92,7 @@ class _Blocks(GridSource):
 
     def __init__(self, file: Path) -> None:
         self.file, self.files = file, (file,)
-        self._opened, self._variables = _variables(file)
+        self._opened = _opened(file)
         try:
             self.time = np.asarray(self._take("time_whole", ...), np.float64).reshape(-1)
             self._points = self._coordinates()
@@ -106,6 +106,12 @@ class _Blocks(GridSource):
 
     def place(self, state: int) -> str:
         return f"{self.file}, state {state}"
+
+    @property
+    def _variables(self) -> Mapping[str, Any]:
+        # Asked for anew each time: SciPy can close its file only once nobody holds a variable.
+        variables: Mapping[str, Any] = getattr(self._opened, "variables", self._opened)
+        return variables
 
     def _take(self, name: str, index: Any) -> NDArray[Any]:
         if name not in self._variables:
@@ -189,7 +195,6 @@ class _Blocks(GridSource):
         return np.concatenate(found)
 
     def close(self) -> None:
-        self._variables = {}
         self._opened.close()
 
 
@@ -204,20 +209,18 @@ def _grouped(names: list[str]) -> dict[str, tuple[int, ...]]:
     return {**vectors, **{name: (k,) for k, name in enumerate(names) if k not in taken}}
 
 
-def _variables(file: Path) -> tuple[Any, Mapping[str, Any]]:
-    """The opened file and its variables, which are indexed like arrays."""
+def _opened(file: Path) -> Any:
+    """The opened file, by SciPy (its variables in `variables`) or h5py (itself a mapping)."""
     with file.open("rb") as stream:
         classic = stream.read(4) in _CLASSIC
     try:
         if classic:
             from scipy.io import netcdf_file
 
-            opened = netcdf_file(str(file), "r", mmap=True)
-            return opened, dict(opened.variables)
+            return netcdf_file(str(file), "r", mmap=True)
         import h5py
 
-        opened = h5py.File(file, "r")
-        return opened, {name: found for name, found in opened.items() if isinstance(found, h5py.Dataset)}
+        return h5py.File(file, "r")
     except Exception as error:  # SciPy raises whatever numpy meets in a damaged header
         raise ReadError(f"{file}: not readable as NetCDF ({error}); it is cut short or damaged") from error
 

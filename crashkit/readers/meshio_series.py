@@ -146,8 +146,9 @@ class _Xdmf(WholeStates):
         if len(self.time) != len(self._reader.collection):
             raise ReadError(f"{file}: {len(self._reader.collection) - len(self.time)} of its states have no time")
         self._mesh = self._reader.mesh_grid
-        named = {item.text.split(":")[0].strip() for item in self._reader.domain.iter("DataItem") if item.text}
-        self.files = (file, *sorted(f for name in named if name and (f := file.parent / name).is_file()))
+        items = self._reader.domain.iter("DataItem")
+        named = {i.text.split(":")[0].strip() for i in items if i.get("Format") == "HDF" and i.text}
+        self.files = (file, *sorted(file.parent / name for name in named if (file.parent / name).is_file()))
 
     def place(self, state: int) -> str:
         return f"{self.file}, state {state}"
