@@ -1,0 +1,255 @@
+"""`crashkit train`: a dataset and settings in, a model folder out."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from crashkit.cli._console import print_json, progress, say, table
+
+if TYPE_CHECKING:
+    from surrogates.model import Surrogate
+    from surrogates.training import Epoch
+
+
+def train(
+    dataset: str | Path,
+    output: str | Path,
+    model: str | None = None,
+    config: str | Path | None = None,
+    overrides: Sequence[str] = (),
+    *,
+    preset: str | None = None,
+    test: str | int | float | slice | Sequence[int | str] | None = None,
+    device: str = "auto",
+    resume: bool = False,
+    overwrite: bool = False,
+    checkpoint_every: int = 0,
+    tensorboard: str | Path | None = None,
+    report: Callable[[Epoch], None] | None = None,
+) -> Surrogate:
+    """Train a surrogate on the dataset at `dataset` and store it as the folder `output`.
+
+    model      mh, podnn, aenn, gaenn, pod-gpr or pod-rbf; without, what `config` says, else mh
+    config     YAML file with the fields of `surrogates.config.Settings`
+    overrides  "path=value", such as "level.epochs=200"; they win over `config`
+    preset     fast, or paper for exactly what the paper does
+    test       runs that nobody may see: "27:36", names, a number or a fraction (drawn at random, seeded)
+    device     cpu, cuda, mps, or the best there is (auto)
+    resume     go on where an interrupted training of the same settings on the same data stopped
+    overwrite  replace a model that is already in `output`
+    checkpoint_every  epochs between two notes of the state of the training, kept beside `output` until it is done;
+                      0: about every half minute
+    tensorboard       folder for TensorBoard files
+    report            told after every epoch
+
+    Ctrl-C ends the training, and what there is gets stored. The folder appears under its name when it is complete.
+
+    Raises SurrogateError for settings and data that do not fit, DataError and ReadError for the dataset, OutputError
+    where `output` cannot be written, Diverged where a loss is not finite: then the last good weights are stored.
+    """
+    from crashkit.cli._campaign import open_campaign
+    from surrogates.checkpoints import Checkpoints
+    from surrogates.config import settings
+    from surrogates.errors import Diverged
+    from surrogates.storage import save
+    from surrogates.train import train as fit
+
+    output = Path(output)
+    chosen = settings(model, preset, config, overrides)
+    check_output(output, overwrite)
+    campaign = open_campaign(dataset, test)
+    state = output.with_name(f".{output.name}.training")
+    with _processes(device) as first, _tensorboard(tensorboard if first else None) as note:
+        keeper = Checkpoints(state, chosen, campaign, every=checkpoint_every, resume=resume)
+
+        def tell(epoch: Epoch) -> None:
+            note(epoch)
+            if report is not None:
+                report(epoch)
+
+        try:
+            surrogate = fit(campaign, chosen, device=device, report=tell, keeper=keeper)
+        except Diverged as error:
+            if error.surrogate is not None and first:
+                save(error.surrogate, output, overwrite=overwrite)
+            raise
+        if first:
+            save(surrogate, output, overwrite=overwrite)
+            if not interrupted(surrogate):
+                keeper.discard()
+    return surrogate
+
+
+def interrupted(surrogate: Surrogate) -> bool:
+    """Whether the training was ended early by Ctrl-C: its state is kept, so that --resume can go on."""
+    return any(fit.status == "interrupted" for fit in surrogate.record.fits.values())
+
+
+def check_output(output: Path, overwrite: bool) -> None:
+    """Raise OutputError if a model cannot be stored as the folder `output`: better now than after the training."""
+    import os
+
+    from crashkit.errors import OutputError
+
+    if output.exists():
+        if not output.is_dir() or (any(output.iterdir()) and not (output / "model.json").exists()):
+            raise OutputError(f"{output}: exists and is no model folder; choose another place with -o")
+        if not overwrite and any(output.iterdir()):
+            raise OutputError(f"{output}: holds a model already; replace it with --overwrite, or choose another place")
+    home = output.absolute().parent
+    try:
+        home.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{output}: cannot be written ({error.strerror}); choose another place with -o") from error
+    if not os.access(home, os.W_OK | os.X_OK):
+        raise OutputError(f"{output}: cannot be written (no permission in {home}); choose another place with -o")
+
+
+@contextlib.contextmanager
+def _processes(device: str) -> Iterator[bool]:
+    """Join the other processes that torchrun started; gives whether this is the one that writes."""
+    import os
+
+    if int(os.environ.get("WORLD_SIZE", "1")) < 2:
+        yield True
+        return
+    import torch
+    from torch import distributed
+
+    cuda = device.startswith("cuda") or (device == "auto" and torch.cuda.is_available())
+    distributed.init_process_group("nccl" if cuda else "gloo")
+    try:
+        yield distributed.get_rank() == 0
+    finally:
+        distributed.destroy_process_group()
+
+
+@contextlib.contextmanager
+def _tensorboard(folder: str | Path | None) -> Iterator[Callable[[Epoch], None]]:
+    """A listener that writes losses and learning rate for TensorBoard into `folder`; without one it does nothing."""
+    if folder is None:
+        yield lambda epoch: None
+        return
+    from crashkit.errors import CrashkitError
+
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise CrashkitError(
+            "TensorBoard files need the package tensorboard; pip install 'crashkit[tracking]'"
+        ) from error
+    writer = SummaryWriter(str(folder))
+
+    def note(epoch: Epoch) -> None:
+        for name in ("total", "approximation", "reconstruction", "validation", "learning_rate"):
+            writer.add_scalar(f"{epoch.name}/{name}", getattr(epoch, name), epoch.epoch)
+
+    try:
+        yield note
+    finally:
+        writer.close()
+
+
+def command(
+    dataset: Annotated[Path, typer.Argument(help="Dataset (.zarr or .nc) with a hierarchy.", show_default=False)],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Model folder.")],
+    model: Annotated[str, typer.Option(help="mh, podnn, aenn, gaenn, pod-gpr or pod-rbf.", show_default="mh")] = "",
+    preset: Annotated[
+        str, typer.Option(help="fast, or paper for exactly what the paper does.", show_default="fast")
+    ] = "",
+    config: Annotated[Path | None, typer.Option(help="Settings as YAML.", show_default=False)] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="One setting: level.latent=8. Repeat for more.")
+    ] = None,
+    test: Annotated[
+        str, typer.Option(help="Runs nobody may see: 27:36, names with commas, a number or a fraction.")
+    ] = "",
+    epochs: Annotated[int | None, typer.Option(help="Epochs of every level.", min=1, show_default=False)] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed.", min=0, show_default=False)] = None,
+    device: Annotated[str, typer.Option(help="cpu, cuda, mps or auto.")] = "auto",
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted training.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the model that is there.")] = False,
+    tensorboard: Annotated[Path | None, typer.Option(help="Folder for TensorBoard files.", show_default=False)] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Train a surrogate and store it as a folder. Ctrl-C ends early and stores what there is."""
+    given = list(settings or ())
+    if epochs is not None:
+        given.append(f"level.epochs={epochs}")
+    if seed is not None:
+        given.append(f"seed={seed}")
+    with _progress(quiet=json) as report:
+        surrogate = train(
+            dataset, output, model or None, config, given, preset=preset or None, test=test or None, device=device,
+            resume=resume, overwrite=overwrite, tensorboard=tensorboard, report=report,
+        )  # fmt: skip
+    _show(surrogate, output, json)
+
+
+@contextlib.contextmanager
+def _progress(quiet: bool) -> Iterator[Callable[[Epoch], None]]:
+    """A bar a level on a terminal, ten lines a level elsewhere."""
+    with progress(quiet=quiet) as bar:
+        tasks: dict[str, Any] = {}
+
+        def report(epoch: Epoch) -> None:
+            if epoch.name not in tasks:
+                tasks[epoch.name] = bar.add_task(epoch.name, total=epoch.epochs, note="")
+            note = (
+                f"total {epoch.total:.3e} = approximation {epoch.approximation:.3e} + reconstruction "
+                f"{epoch.reconstruction:.3e}, validation {epoch.validation:.3e} (best in epoch {epoch.best_epoch}), "
+                f"{epoch.rate:.1f} epochs/s"
+            )
+            bar.update(tasks[epoch.name], completed=epoch.epoch, note=note)
+            every = max(1, epoch.epochs // 10)
+            if bar.disable and not quiet and (epoch.epoch % every == 0 or epoch.epoch == epoch.epochs):
+                say(f"{epoch.name} {epoch.epoch}/{epoch.epochs}  {note}, {epoch.seconds_left:.0f} s left")
+
+        yield report
+
+
+def _show(surrogate: Surrogate, output: Path, as_json: bool) -> None:
+    """What was trained and how well it does on validation runs."""
+    record = surrogate.record
+    rows = [
+        {
+            "model": name,
+            "level": number,
+            "nodes": surrogate.graphs.n_nodes(number),
+            "parameters": surrogate.n_parameters(number),
+            "epochs": record.fits[number].epochs,
+            "best_epoch": record.fits[number].best_epoch,
+            "seconds": round(record.fits[number].seconds, 2),
+            "status": record.fits[number].status,
+        }
+        for name, number in surrogate.level_names.items()
+    ]
+    if as_json:
+        print_json(
+            {
+                "output": output, "levels": rows, "choice": record.choice, "validation_errors_m": record.errors,
+                "training_runs": record.fitted_runs, "validation_runs": record.validation_runs,
+                "held_out_runs": record.held_out_runs, "notes": record.notes,
+            }
+        )  # fmt: skip
+        return
+    for line in record.notes:
+        say(f"note: {line}")
+    table(
+        f"{output}: {len(record.fitted_runs)} training, {len(record.validation_runs)} validation, "
+        f"{len(record.held_out_runs)} held-out runs",
+        ("model", "nodes", "parameters", "epochs", "best", "training (s)"),
+        (
+            (r["model"], r["nodes"], r["parameters"], r["epochs"] or "-", r["best_epoch"] or "-", f"{r['seconds']:.1f}")
+            for r in rows
+        ),
+    )
+    if record.choice:
+        say("chosen on validation runs: " + ", ".join(f"{k} {v}" for k, v in record.choice.items()))
+    if interrupted(surrogate):
+        say("interrupted: the best weights so far are stored; --resume --overwrite goes on from here")
