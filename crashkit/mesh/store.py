@@ -92,7 +92,7 @@ def read_hierarchy(path: str | Path) -> Hierarchy:
                     to_finer=_csr(group, "to_finer", n_finer, group.sizes["level_node"]),
                     to_full=_csr(group, "to_full", n_full, group.sizes["level_node"]),
                     distance=group["distance"].values.astype(np.float64),
-                    face_part=group["face_part"].values.astype(np.int32),
+                    face_part=group["face_part"].values.astype(np.int32) if "face_part" in group else None,
                 )
             except (KeyError, ValueError) as error:
                 raise ReadError(
@@ -268,6 +268,8 @@ def _write_level(target: _Target, level: Level, error: LiftingError) -> None:
     target.array(
         group, "faces", ("level_face", "level_corner"), level.faces, {"long_name": "triangles, nodes of this level"}
     )
+    if level.face_part is not None:
+        target.array(group, "face_part", ("level_face",), level.face_part, {"long_name": "part of each face"})
     target.array(
         group, "edges", ("level_edge", "level_end"), level.edges, {"long_name": "graph edges, nodes of this level"}
     )
