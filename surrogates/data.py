@@ -4,10 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+
+
+class Field(Protocol):
+    """Displacements (sim, state, node, 3) float32, m, of which one run at a time is taken; a numpy array is one."""
+
+    @property
+    def shape(self) -> tuple[int, ...]: ...
+
+    def __getitem__(self, run: int, /) -> NDArray[np.float32]: ...
 
 
 @dataclass(frozen=True)
@@ -38,20 +48,26 @@ class Campaign:
     time            (state,) float64, s
     displacement    level index -> (sim, state, node of that level, 3) float32, m. Called with 0 for the full mesh
                     only by models that work there (POD baselines, AENN, GAENN); the cascade asks for its levels.
+                    Anything that gives one run when indexed will do, so the full field need not be in memory.
     full_edges      (e, 2) graph edges of level 0, for models that convolve there
     levels          coarse levels, level 1 first; may be empty for POD baselines
     runs            names of the runs, for messages and the model card
+    held_out        names of the runs that were kept away (the test runs), for the record
     checksum        SHA-256 that identifies the dataset
+    points, faces   the full mesh (node, 3), m, and (face, corner), stored with the model so that it draws without data
     """
 
     parameters: NDArray[np.float64]
     parameter_names: tuple[str, ...]
     parameter_units: tuple[str, ...]
     time: NDArray[np.float64]
-    displacement: Callable[[int], NDArray[np.float32]]
+    displacement: Callable[[int], Field]
     n_nodes: int
     levels: tuple[GraphLevel, ...] = ()
     full_edges: NDArray[np.int32] | None = None
     runs: tuple[str, ...] = ()
     checksum: str = ""
     attributes: Mapping[str, str] | None = None
+    held_out: tuple[str, ...] = ()
+    points: NDArray[np.float64] | None = None
+    faces: NDArray[np.int32] | None = None

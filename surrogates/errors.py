@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from surrogates.model import Surrogate
+    from surrogates.training import Fit
+
 
 class SurrogateError(Exception):
     """One line: what was found, what was expected, what to do."""
@@ -12,4 +18,11 @@ class ModelFolderError(SurrogateError):
 
 
 class Diverged(SurrogateError):
-    """A loss became NaN or infinite; names the model, level and epoch. The last good weights are kept."""
+    """A loss became NaN or infinite; names the model, level and epoch. The last good weights are kept.
+
+    fit        how the training went until then
+    surrogate  what can be used: the finished levels, and this one with its best weights; None without any
+    """
+
+    fit: Fit | None = None
+    surrogate: Surrogate | None = None

@@ -1,0 +1,108 @@
+"""The model card: what a surrogate is, what it has seen and how well it did, in Markdown for people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import yaml
+
+if TYPE_CHECKING:
+    from surrogates.model import Surrogate
+
+
+def card(surrogate: Surrogate) -> str:
+    """Markdown."""
+    record, settings = surrogate.record, surrogate.settings
+    ranges = record.ranges
+    names = " -> ".join(surrogate.level_names)
+    lines = [
+        f"# {names}",
+        "",
+        f"Surrogate of kind `{settings.model}` (preset `{settings.preset}`), fitted {record.created} with seed {record.seed}.",
+        "It predicts nodal displacements in metres for given parameters and times.",
+        "",
+        "## Inputs",
+        "",
+        *_table(
+            ("parameter", "unit", "from", "to"),
+            [
+                (n, u, f"{a:g}", f"{b:g}")
+                for n, u, a, b in zip(ranges.names, ranges.units, ranges.low, ranges.high, strict=True)
+            ]
+            + [("time", "s", f"{ranges.time[0]:g}", f"{ranges.time[1]:g}")],
+        ),
+        "",
+        "Outside these ranges predictions are extrapolations; `crashkit predict` says so.",
+        "",
+        "## Levels",
+        "",
+        *_table(
+            ("model", "mesh level", "nodes", "latent", "parameters", "epochs", "best epoch", "training (s)", "status"),
+            [_level_row(surrogate, name, number) for name, number in surrogate.level_names.items()],
+        ),
+        "",
+        "## Errors on validation runs",
+        "",
+    ]
+    if record.errors:
+        lines += [
+            "Mean distance between true and predicted nodes over nodes, states and validation runs, on each level's own",
+            "nodes. Validation runs chose the weights kept (or the number of modes), so test runs may be worse.",
+            "",
+            *_table(("measured", "error (cm)"), [(k, f"{100 * v:.3f}") for k, v in record.errors.items()]),
+        ]
+    else:
+        lines.append("None were held out, so there is no independent error here.")
+    lines += ["", "## Data", "", f"- dataset checksum (SHA-256): `{record.checksum or 'not recorded'}`"]
+    lines += [f"- {key}: {value}" for key, value in record.attributes.items()]
+    lines += [
+        f"- {len(record.fitted_runs)} training runs: {_runs(record.fitted_runs)}",
+        f"- {len(record.validation_runs)} validation runs: {_runs(record.validation_runs)}",
+        f"- {len(record.held_out_runs)} runs kept away: {_runs(record.held_out_runs)}",
+        "",
+    ]
+    if record.notes:
+        lines += ["## Notes", "", *(f"- {note}" for note in record.notes), ""]
+    if record.choice:
+        lines += [f"Chosen on validation runs: {', '.join(f'{k} {v}' for k, v in record.choice.items())}.", ""]
+    lines += [
+        "## Settings",
+        "",
+        "```yaml",
+        yaml.safe_dump(settings.as_dict(), sort_keys=False).rstrip(),
+        "```",
+        "",
+        "Versions: " + ", ".join(f"{k} {v}" for k, v in record.versions.items()) + ".",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _level_row(surrogate: Surrogate, name: str, number: int) -> tuple[str, ...]:
+    kept = surrogate.record.fits.get(number)
+    epochs = str(kept.epochs) if kept is not None and kept.epochs else "-"
+    return (
+        name,
+        str(number),
+        str(surrogate.graphs.n_nodes(number)),
+        str(surrogate.n_latent(number)),
+        str(surrogate.n_parameters(number)),
+        epochs,
+        str(kept.best_epoch) if kept is not None and kept.best_epoch else "-",
+        f"{kept.seconds:.1f}" if kept is not None else "-",
+        kept.status if kept is not None else "-",
+    )
+
+
+def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
+    head = list(head)
+    return [
+        "| " + " | ".join(head) + " |",
+        "|" + "---|" * len(head),
+        *("| " + " | ".join(row) + " |" for row in rows),
+    ]
+
+
+def _runs(names: tuple[str, ...]) -> str:
+    return ", ".join(names) if names else "none"

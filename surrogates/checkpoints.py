@@ -1,0 +1,92 @@
+"""The state of a training between epochs, so that a killed one goes on where it was."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from surrogates.config import Settings
+from surrogates.data import Campaign
+from surrogates.errors import SurrogateError
+
+_IDENTITY = "training.json"
+_SECONDS = 30.0
+
+
+class Checkpoints:
+    """A folder with one file a level: its tensors, and the rest as JSON in the file's header.
+
+    every   epochs between two files of one level; 0: about every half minute
+    resume  go on from what is there, which must be the same training; without, the folder starts empty
+
+    Raises SurrogateError if there is nothing to resume, or it belongs to another training.
+    """
+
+    def __init__(
+        self, folder: Path, settings: Settings, campaign: Campaign, *, every: int = 0, resume: bool = False
+    ) -> None:
+        self.folder, self.every = folder, every
+        self._last = time.monotonic()
+        self._writes = _rank() == 0
+        identity = {"settings": settings.as_dict(), "data": campaign.checksum, "runs": list(campaign.runs)}
+        if resume:
+            self._check(identity)
+        elif self._writes:
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True)
+            (folder / _IDENTITY).write_text(json.dumps(identity), encoding="utf-8")
+
+    def load(self, name: str) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
+        """Tensors and the rest of level `name`, or None."""
+        path = self._path(name)
+        if not path.exists():
+            return None
+        try:
+            with safe_open(path, framework="pt") as file:
+                tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+                return tensors, json.loads((file.metadata() or {})["about"])
+        except (SafetensorError, KeyError, ValueError) as error:
+            raise SurrogateError(f"{path}: is damaged ({error}); train again without resuming") from error
+
+    def due(self, epoch: int) -> bool:
+        """Whether it is time to write, after `epoch` epochs."""
+        return epoch % self.every == 0 if self.every else time.monotonic() - self._last >= _SECONDS
+
+    def save(self, name: str, tensors: dict[str, Tensor], about: dict[str, Any]) -> None:
+        """Write level `name`; the file before stays until the new one is complete."""
+        path = self._path(name)
+        beside = path.with_suffix(".part")
+        save_file({k: v.contiguous().cpu() for k, v in tensors.items()}, beside, {"about": json.dumps(about)})
+        beside.replace(path)
+        self._last = time.monotonic()
+
+    def discard(self) -> None:
+        """Forget everything: the training is finished and stored."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _path(self, name: str) -> Path:
+        return self.folder / f"{name}.safetensors"
+
+    def _check(self, identity: dict[str, Any]) -> None:
+        mark = self.folder / _IDENTITY
+        try:
+            stored = json.loads(mark.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise SurrogateError(f"{self.folder}: holds no training to go on from; train without resuming") from error
+        for key, value in identity.items():
+            if stored.get(key) != json.loads(json.dumps(value)):
+                raise SurrogateError(
+                    f"{self.folder}: belongs to a training with other {key}; train without resuming, or with the same {key}"
+                )
+
+
+def _rank() -> int:
+    return torch.distributed.get_rank() if torch.distributed.is_initialized() else 0

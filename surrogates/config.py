@@ -1,0 +1,307 @@
+"""What can be chosen: one model, checked once, stored with every surrogate.
+
+Settings come from four places, later ones winning: the defaults of a preset ("fast", or "paper" for exactly what the
+paper does), the model's own, a YAML file, and overrides such as `level.epochs=200`. Widths are derived from the data;
+nobody types the number of nodes or inputs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from surrogates.errors import SurrogateError
+
+Model = Literal["mh", "podnn", "aenn", "gaenn", "pod-gpr", "pod-rbf"]
+Preset = Literal["fast", "paper"]
+MODELS: tuple[Model, ...] = ("mh", "podnn", "aenn", "gaenn", "pod-gpr", "pod-rbf")
+PRESETS: tuple[Preset, ...] = ("fast", "paper")
+
+Positive = Annotated[int, Field(ge=1)]
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+
+class MlpSettings(_Frozen):
+    """The network from parameters and time to the latent vector; linear after the last hidden layer."""
+
+    widths: tuple[Positive, ...] = (64, 64, 64)
+    activation: Literal["elu", "gelu", "silu", "tanh"] = "elu"
+
+
+class LevelSettings(_Frozen):
+    """One level: its reduction, its regression and how both are trained.
+
+    reduction      gcn: graph convolutions and a dense layer; ae: fully connected; pod: linear, computed, not trained
+    convolution    of gcn: Chebyshev (cheb), first order (gcn) or with initial residual (gcn2)
+    channels       of gcn, behind the three coordinates
+    order          Chebyshev terms
+    hidden         of ae: widths between state and latent vector
+    start          pod: reduction gcn or ae beside a trainable linear part that starts at POD, its own end at zero
+    """
+
+    reduction: Literal["gcn", "ae", "pod"] = "gcn"
+    convolution: Literal["cheb", "gcn", "gcn2"] = "cheb"
+    latent: Positive = 4
+    channels: tuple[Positive, ...] = (6, 12, 24)
+    order: Positive = 3
+    hidden: tuple[Positive, ...] = (200, 80)
+    start: Literal["plain", "pod"] = "plain"
+    mlp: MlpSettings = MlpSettings()
+
+    epochs: Positive = 1500
+    batch: Positive = 32
+    learning_rate: Annotated[float, Field(gt=0)] = 1e-3
+    schedule: Literal["constant", "one_cycle", "cosine"] = "constant"
+    optimiser: Literal["adamw", "adam", "sgd"] = "adamw"
+    weight_decay: Annotated[float, Field(ge=0)] = 0.0
+    clip: Annotated[float, Field(ge=0)] = 0.0
+    weight_approximation: Annotated[float, Field(ge=0)] = 1.0
+    weight_reconstruction: Annotated[float, Field(ge=0)] = 1.0
+
+    @field_validator("channels")
+    @classmethod
+    def _some(cls, value: tuple[int, ...]) -> tuple[int, ...]:
+        if not value:
+            raise ValueError("at least one convolution is needed")
+        return value
+
+
+class TransferSettings(_Frozen):
+    """What a level takes over from the frozen coarser one (section 3.4).
+
+    upsampling  static: the barycentric U; sparse: only U's non-zeros train; linear: all of W x + b (equation 12)
+    encoder     add: z = enc(D x) + enc*(x); concat: both side by side, so the latent vector grows
+    mlp         input: the coarse output is a further input; residual: it is also added to the result
+    """
+
+    upsampling: Literal["static", "sparse", "linear"] = "linear"
+    encoder: Literal["add", "concat"] = "add"
+    mlp: Literal["input", "residual"] = "input"
+
+
+class InputSettings(_Frozen):
+    """What the regression sees beside the parameters and the time, each scaled to [-1, 1].
+
+    products       each parameter times the time
+    angles         sine and cosine of parameters in degree
+    initial_state  the encoded first state of the run (z0)
+    """
+
+    products: bool = False
+    angles: bool = False
+    initial_state: bool = False
+
+
+class ValidationSettings(_Frozen):
+    """Which weights are kept: those of the epoch with the lowest total loss.
+
+    measure  runs: on runs held out of the training runs; paper: on the training runs themselves
+    share    of the training runs held out, drawn by the seed; `runs` names them instead
+    """
+
+    measure: Literal["runs", "paper"] = "runs"
+    share: Annotated[float, Field(gt=0, lt=1)] = 1 / 8
+    runs: tuple[str, ...] = ()
+
+
+class RefinementSettings(_Frozen):
+    """Adaptive refinement: finer levels only where the coarser one is wrong (section 3.5).
+
+    share  of the coarse nodes with the largest validation error that count as faulty
+    rings  how many rings of neighbours in the finer graph are added around each
+    """
+
+    adaptive: bool = False
+    share: Annotated[float, Field(gt=0, le=1)] = 0.25
+    rings: Positive = 1
+
+
+class PodSettings(_Frozen):
+    """POD with Gaussian processes or radial basis functions.
+
+    modes   numbers of modes to choose from on validation runs
+    inputs  trajectory: a whole run is one sample; point: parameters and time are the inputs; auto: validation decides
+    points  most samples of "point" that a Gaussian process is given
+    """
+
+    modes: tuple[Positive, ...] = (2, 4, 8, 12, 16, 24, 32, 48)
+    inputs: Literal["auto", "trajectory", "point"] = "auto"
+    points: Positive = 800
+
+
+class Settings(_Frozen):
+    """Everything that decides what a surrogate becomes, besides the data.
+
+    levels     mesh levels the cascade climbs, coarsest first; empty: all that the hierarchy has
+    level      settings of every level
+    at         settings of single levels by their number, over those of `level`
+    unified    one latent vector for all levels, trained together (section 3.5)
+    precision  tf32 and bfloat16 (dense layers only) speed up a GPU
+    missing    values of eroded nodes: refuse, or hold each node's last displacement
+    """
+
+    model: Model = "mh"
+    preset: Preset = "fast"
+    seed: Annotated[int, Field(ge=0)] = 0
+    levels: tuple[Annotated[int, Field(ge=0)], ...] = ()
+    level: LevelSettings = LevelSettings()
+    at: Mapping[int, Mapping[str, Any]] = {}
+    transfer: TransferSettings = TransferSettings()
+    inputs: InputSettings = InputSettings()
+    validation: ValidationSettings = ValidationSettings()
+    refinement: RefinementSettings = RefinementSettings()
+    unified: bool = False
+    pod: PodSettings = PodSettings()
+    precision: Literal["float32", "tf32", "bfloat16"] = "float32"
+    missing: Literal["refuse", "hold"] = "refuse"
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Settings:
+        if len(set(self.levels)) != len(self.levels):
+            raise ValueError(f"levels {list(self.levels)} names a level twice")
+        if list(self.levels) != sorted(self.levels, reverse=True):
+            raise ValueError(f"levels {list(self.levels)} must go from coarse to fine, the largest number first")
+        for number in self.at:
+            self.for_level(number)
+        latents = {self.for_level(k).latent for k in (*self.at, -1)}
+        if len(latents) > 1 and self.transfer.encoder == "add":
+            raise ValueError(f"latent sizes {sorted(latents)} differ; transfer.encoder=add needs one size")
+        if self.unified and self.refinement.adaptive:
+            raise ValueError("unified trains all levels together, refinement.adaptive one after the other; choose one")
+        if self.unified and self.transfer.encoder == "concat":
+            raise ValueError("unified has one latent vector, so transfer.encoder=concat means nothing")
+        return self
+
+    def for_level(self, number: int) -> LevelSettings:
+        """The settings of level `number`: those of `level`, and what `at` says of it."""
+        own = self.at.get(number)
+        return self.level if own is None else LevelSettings.model_validate(_merged(self.level.model_dump(), own))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, as they go into JSON and YAML."""
+        return self.model_dump(mode="json")
+
+
+# The fast preset keeps the paper's architecture and loss; `docs/surrogates.md` has the measurements behind it.
+_FAST: dict[str, Any] = {
+    "level": {
+        "latent": 16,
+        "start": "pod",
+        "mlp": {"widths": [64] * 6, "activation": "gelu"},
+        "epochs": 300,
+        "batch": 64,
+        "learning_rate": 4e-3,
+        "schedule": "one_cycle",
+        "weight_decay": 1e-4,
+    },
+    "transfer": {"mlp": "residual"},
+}
+_PRESETS: Mapping[str, dict[str, Any]] = {"fast": _FAST, "paper": {}}
+_OF_MODEL: Mapping[str, dict[str, Any]] = {
+    "podnn": {"level": {"reduction": "pod", "start": "plain", "latent": 4}, "levels": [0]},
+    "aenn": {"level": {"reduction": "ae", "start": "plain"}, "levels": [0]},
+    "gaenn": {"level": {"reduction": "gcn"}, "levels": [0]},
+}
+
+
+def settings(
+    model: str | None = None,
+    preset: str | None = None,
+    file: str | Path | None = None,
+    overrides: Iterable[str] = (),
+) -> Settings:
+    """The settings for one training.
+
+    file       YAML with the fields of `Settings`; its `model` and `preset` hold unless given here
+    overrides  "path=value" with a dotted path and a YAML value, such as "level.mlp.widths=[32, 32]" or "at.3.epochs=9"
+
+    Raises SurrogateError naming the field, what was found and what is possible.
+    """
+    given: dict[Any, Any] = _read(Path(file)) if file is not None else {}
+    for text in overrides:
+        given = _merged(given, _override(text))
+    model, preset = model or given.get("model", "mh"), preset or given.get("preset", "fast")
+    if model not in MODELS:
+        raise SurrogateError(f"model {model!r} is not known; choose {_listed(MODELS)}")
+    if preset not in PRESETS:
+        raise SurrogateError(f"preset {preset!r} is not known; choose {_listed(PRESETS)}")
+    values = _merged(_merged(_PRESETS[preset], _OF_MODEL.get(model, {})), given)
+    return parse({**values, "model": model, "preset": preset}, str(file or "settings"))
+
+
+def parse(values: Mapping[str, Any], where: str) -> Settings:
+    """`values` as settings; raises SurrogateError with `where` and the field."""
+    try:
+        return Settings.model_validate(values)
+    except ValidationError as error:
+        raise SurrogateError(f"{where}: {_told(error)}") from error
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        values = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except yaml.YAMLError as error:
+        raise SurrogateError(f"{file}: is no YAML ({' '.join(str(error).split())[:160]})") from error
+    except UnicodeDecodeError as error:
+        raise SurrogateError(f"{file}: is no text; expected YAML settings") from error
+    if values is None:
+        return {}
+    if not isinstance(values, dict):
+        raise SurrogateError(f"{file}: holds a {type(values).__name__}; expected fields such as level: {{epochs: 200}}")
+    return values
+
+
+def _override(text: str) -> dict[Any, Any]:
+    path, equals, value = text.partition("=")
+    if not equals or not path.strip():
+        raise SurrogateError(f"setting {text!r} not understood; expected path=value, such as level.epochs=200")
+    try:
+        parsed = yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise SurrogateError(f"setting {text!r}: the value is no YAML") from error
+    if isinstance(parsed, str):  # YAML 1.1 reads 1e-3 as text
+        with contextlib.suppress(ValueError):
+            parsed = float(parsed)
+    out: Any = parsed
+    for key in reversed(path.strip().split(".")):
+        out = {int(key) if key.isdigit() else key: out}
+    return out
+
+
+def _merged(below: Mapping[Any, Any], above: Mapping[Any, Any]) -> dict[Any, Any]:
+    """`above` over `below`, mapping by mapping."""
+    out = dict(below)
+    for key, value in above.items():
+        old = out.get(key)
+        out[key] = _merged(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
+    return out
+
+
+def _told(error: ValidationError) -> str:
+    first = error.errors()[0]
+    place = ".".join(str(p) for p in first["loc"]) or "settings"
+    if first["type"] == "extra_forbidden":
+        fields = _fields_at(first["loc"][:-1])
+        return f"{place} is not a setting" + (f"; there are {_listed(fields)}" if fields else "")
+    message = first["msg"].removeprefix("Value error, ")
+    return f"{place} = {first['input']!r}: {message}" if first["loc"] else message
+
+
+def _fields_at(place: tuple[int | str, ...]) -> list[str]:
+    kind: Any = Settings
+    for key in place:
+        field = kind.model_fields.get(str(key)) if isinstance(kind, type) and issubclass(kind, BaseModel) else None
+        kind = None if field is None else field.annotation
+    return list(kind.model_fields) if isinstance(kind, type) and issubclass(kind, BaseModel) else []
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(names)

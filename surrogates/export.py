@@ -1,0 +1,137 @@
+"""A level as one file for programs without this package: ONNX, or a torch.export program; every graph in dense form.
+
+Inputs: parameters (batch, parameter) float64 in the units of the training data, and time (batch,) float64, s. Output:
+displacement (batch, node, 3) float32, m, on the level's nodes, or on the full mesh.
+"""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from surrogates.cascade import Cascade
+from surrogates.errors import SurrogateError
+from surrogates.model import Surrogate
+from surrogates.operators import exportable
+from surrogates.upsampling import Upsampling
+
+SUFFIXES = (".onnx", ".pt2")
+# Largest difference to the surrogate itself, relative to its largest displacement, at which a file is accepted.
+TOLERANCE = 1e-5
+
+
+class LevelProgram(nn.Module):
+    """(parameters, time) -> displacements of one level, lifted to the full mesh by its static U if asked."""
+
+    def __init__(self, cascade: Cascade, number: int, lift: Upsampling | None) -> None:
+        super().__init__()
+        self.cascade = cascade
+        self.number = number
+        self.lift = lift
+
+    def forward(self, parameters: Tensor, time: Tensor) -> Tensor:
+        states = self.cascade(parameters, time, self.number)
+        return (states if self.lift is None else self.lift(states)).transpose(0, 1)
+
+
+def export(surrogate: Surrogate, path: str | Path, level: int | None = None, *, full: bool = False) -> float:
+    """Write `level` (default: the finest) to `path`, .onnx or .pt2 by the suffix, and hold it against the surrogate.
+
+    Returns the largest difference on the corners and the middle of the trained range, relative to the largest
+    displacement. The file only stands under its name if that is at most `TOLERANCE`.
+
+    Raises SurrogateError for POD regressions, other suffixes, missing packages, and a file that disagrees.
+    """
+    path = Path(path)
+    if path.suffix not in SUFFIXES:
+        raise SurrogateError(f"{path}: the suffix says what is written; expected {' or '.join(SUFFIXES)}")
+    if not isinstance(surrogate.core, Cascade):
+        raise SurrogateError(
+            f"{surrogate.settings.model} is no network; export takes mh, podnn, aenn and gaenn. Its folder holds plain arrays"
+        )
+    number = min(surrogate.core.numbers) if level is None else level
+    lift = Upsampling(surrogate.graphs.to_full(number), "static") if full and number else None
+    parameters, time = _probes(surrogate)
+    states = surrogate.predict_full if full else surrogate.predict
+    wanted = np.stack([states(p, t[None], number)[0] for p, t in zip(parameters, time, strict=True)])
+    program = LevelProgram(surrogate.core, number, lift).eval()
+    beside = path.with_name(f".{path.name}.part{path.suffix}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with exportable(program), _quiet(), torch.no_grad():
+            exported = torch.export.export(
+                program,
+                (torch.from_numpy(parameters), torch.from_numpy(time)),
+                dynamic_shapes={
+                    "parameters": {0: torch.export.Dim("batch", min=1)},
+                    "time": {0: torch.export.Dim("batch", min=1)},
+                },
+            )
+            found = (_write_onnx if path.suffix == ".onnx" else _write_program)(exported, beside, parameters, time)
+        error = float(np.abs(found - wanted).max() / (np.abs(wanted).max() or 1.0))
+        if not error <= TOLERANCE:
+            raise SurrogateError(
+                f"{path}: the exported model differs by {error:.1e} of the largest displacement; not kept"
+            )
+        beside.replace(path)
+    finally:
+        beside.unlink(missing_ok=True)
+    return error
+
+
+def _write_onnx(
+    exported: torch.export.ExportedProgram, path: Path, parameters: np.ndarray, time: np.ndarray
+) -> np.ndarray:
+    try:
+        import onnxruntime
+        import onnxscript  # noqa: F401 - torch.onnx needs it
+    except ImportError as error:
+        raise SurrogateError(
+            "ONNX files need onnx, onnxscript and onnxruntime; pip install 'crashkit[export]'"
+        ) from error
+    torch.onnx.export(
+        exported, f=str(path), dynamo=True, input_names=["parameters", "time"], output_names=["displacement"],
+        external_data=False, verbose=False,
+    )  # fmt: skip
+    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    return session.run(None, {"parameters": parameters, "time": time})[0]
+
+
+def _write_program(
+    exported: torch.export.ExportedProgram, path: Path, parameters: np.ndarray, time: np.ndarray
+) -> np.ndarray:
+    torch.export.save(exported, path)
+    program = torch.export.load(path).module()
+    return program(torch.from_numpy(parameters), torch.from_numpy(time)).detach().numpy()
+
+
+def _probes(surrogate: Surrogate) -> tuple[np.ndarray, np.ndarray]:
+    """Ends and middle of every range, and points drawn between them: (9, parameter) and (9,)."""
+    ranges = surrogate.record.ranges
+    low, high = np.append(ranges.low, ranges.time[0]), np.append(ranges.high, ranges.time[1])
+    share = np.concatenate(
+        [np.array([[0.0], [0.5], [1.0]]) + np.zeros(len(low)), np.random.default_rng(0).random((6, len(low)))]
+    )
+    at = low + share * (high - low)
+    return np.ascontiguousarray(at[:, :-1]), np.ascontiguousarray(at[:, -1])
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without the exporters' chatter."""
+    logger = logging.getLogger("torch.onnx")
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(before)

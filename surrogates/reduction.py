@@ -1,0 +1,176 @@
+"""Reductions: states (node, batch, 3) to latent vectors (batch, latent) and back.
+
+Each is a module with `encode` and `decode`; a level does not care which one it holds. Adding a reduction is one class
+here and one line in `make_reduction`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from surrogates.config import LevelSettings
+from surrogates.errors import SurrogateError
+from surrogates.networks import fully_connected
+from surrogates.operators import GraphDecoder, GraphEncoder, GraphOperator
+
+
+class Reduction(nn.Module):
+    """What a level needs of a reduction."""
+
+    def encode(self, x: Tensor) -> Tensor:
+        """(node, batch, 3) -> (batch, latent)"""
+        raise SurrogateError(f"{type(self).__name__} cannot encode")
+
+    def decode(self, z: Tensor) -> Tensor:
+        """(batch, latent) -> (node, batch, 3)"""
+        raise SurrogateError(f"{type(self).__name__} cannot decode")
+
+
+@dataclass(frozen=True)
+class LinearStart:
+    """Where a linear reduction starts: z = encode^T x, x = decode z + offset.
+
+    encode  (3 * node, latent), decode (3 * node, latent), offset (3 * node,)
+    """
+
+    encode: Tensor
+    decode: Tensor
+    offset: Tensor
+
+
+class GraphReduction(Reduction):
+    """Graph convolutions, then one dense linear layer; the decoder in reverse order (section 3.3, table 1)."""
+
+    def __init__(self, operator: GraphOperator, latent: int, decoded: int, channels: Sequence[int], order: int) -> None:
+        super().__init__()
+        widths = (3, *channels)
+        self.encoder = GraphEncoder(operator, latent, widths, order)
+        self.decoder = GraphDecoder(operator, decoded, widths[::-1], order)
+
+    def encode(self, x: Tensor) -> Tensor:
+        return self.encoder(x)
+
+    def decode(self, z: Tensor) -> Tensor:
+        return self.decoder(z)
+
+    def end_at_zero(self) -> None:
+        """Both ends at zero: what stands beside this reduction is all there is, until training moves it."""
+        for layer in (self.encoder.dense, _last_layer(self.decoder)):
+            for parameter in layer.parameters():
+                nn.init.zeros_(parameter)
+
+
+class DenseReduction(Reduction):
+    """Fully connected autoencoder 3n -> hidden -> latent with ELU, the decoder in reverse order (table 1)."""
+
+    def __init__(self, n_nodes: int, latent: int, decoded: int, hidden: Sequence[int]) -> None:
+        super().__init__()
+        self.n_nodes = n_nodes
+        self.encoder = fully_connected((3 * n_nodes, *hidden, latent))
+        self.decoder = fully_connected((decoded, *hidden[::-1], 3 * n_nodes))
+
+    def encode(self, x: Tensor) -> Tensor:
+        return self.encoder(flat(x))
+
+    def decode(self, z: Tensor) -> Tensor:
+        return unflat(self.decoder(z), self.n_nodes)
+
+    def end_at_zero(self) -> None:
+        for network in (self.encoder, self.decoder):
+            for parameter in network[-1].parameters():
+                nn.init.zeros_(parameter)
+
+
+class LinearReduction(Reduction):
+    """z = E^T x and x = D z + offset: POD, fixed or as a trainable start."""
+
+    def __init__(self, n_nodes: int, latent: int, decoded: int, *, trainable: bool) -> None:
+        super().__init__()
+        self.n_nodes = n_nodes
+        self.encode_matrix = nn.Parameter(torch.zeros(3 * n_nodes, latent), requires_grad=trainable)
+        self.decode_matrix = nn.Parameter(torch.zeros(3 * n_nodes, decoded), requires_grad=trainable)
+        self.offset = nn.Parameter(torch.zeros(3 * n_nodes), requires_grad=trainable)
+
+    def start_at(self, start: LinearStart) -> None:
+        """Take over the matrices of `start`."""
+        with torch.no_grad():
+            for mine, given in ((self.encode_matrix, start.encode), (self.decode_matrix, start.decode)):
+                if mine.shape != given.shape:
+                    raise SurrogateError(f"a linear start of shape {tuple(given.shape)}; expected {tuple(mine.shape)}")
+                mine.copy_(given)
+            self.offset.copy_(start.offset)
+
+    def encode(self, x: Tensor) -> Tensor:
+        return flat(x) @ self.encode_matrix
+
+    def decode(self, z: Tensor) -> Tensor:
+        return unflat(torch.addmm(self.offset, z, self.decode_matrix.t()), self.n_nodes)
+
+
+class SumReduction(Reduction):
+    """A linear reduction and a nonlinear one, added in both directions."""
+
+    def __init__(self, linear: LinearReduction, remainder: GraphReduction | DenseReduction) -> None:
+        super().__init__()
+        self.linear = linear
+        self.remainder = remainder
+        remainder.end_at_zero()
+
+    def encode(self, x: Tensor) -> Tensor:
+        return self.linear.encode(x) + self.remainder.encode(x)
+
+    def decode(self, z: Tensor) -> Tensor:
+        return self.linear.decode(z) + self.remainder.decode(z)
+
+
+def make_reduction(settings: LevelSettings, edges: object, n_nodes: int, decoded: int | None = None) -> Reduction:
+    """The reduction that `settings` describe, on a graph of `n_nodes` with edges (e, 2).
+
+    `decoded` is the length of the latent vector that the decoder reads: longer than the encoder's where the latent
+    vectors of several levels stand side by side.
+
+    Raises SurrogateError for a latent vector longer than the state.
+    """
+    latent, decoded = settings.latent, decoded or settings.latent
+    if latent > 3 * n_nodes:
+        raise SurrogateError(
+            f"latent size {latent} exceeds the {3 * n_nodes} displacements of {n_nodes} nodes; choose a smaller level.latent"
+        )
+    if settings.reduction == "pod":
+        return LinearReduction(n_nodes, latent, decoded, trainable=False)
+    if settings.reduction == "gcn":
+        operator = GraphOperator(edges, n_nodes, kind=settings.convolution)  # type: ignore[arg-type]
+        made: GraphReduction | DenseReduction = GraphReduction(
+            operator, latent, decoded, settings.channels, settings.order
+        )
+    else:
+        made = DenseReduction(n_nodes, latent, decoded, settings.hidden)
+    if settings.start == "plain":
+        return made
+    return SumReduction(LinearReduction(n_nodes, latent, decoded, trainable=True), made)
+
+
+def linear_part(reduction: Reduction) -> LinearReduction | None:
+    """The linear reduction in it, if there is one."""
+    if isinstance(reduction, SumReduction):
+        return reduction.linear
+    return reduction if isinstance(reduction, LinearReduction) else None
+
+
+def flat(x: Tensor) -> Tensor:
+    """(node, batch, 3) -> (batch, 3 * node), the coordinates of a node side by side."""
+    return x.transpose(0, 1).reshape(x.shape[1], -1)
+
+
+def unflat(rows: Tensor, n_nodes: int) -> Tensor:
+    """(batch, 3 * node) -> (node, batch, 3)"""
+    return rows.view(rows.shape[0], n_nodes, 3).transpose(0, 1)
+
+
+def _last_layer(decoder: GraphDecoder) -> nn.Module:
+    after = decoder.convolutions.after
+    return after if isinstance(after, nn.Linear) else decoder.convolutions.layers[-1]

@@ -1,0 +1,92 @@
+"""Linear parts of a reduction, computed from the training states instead of trained from nothing.
+
+On the coarsest level they are POD modes, each divided by its coefficients' RMS, so that latent vectors are of order
+one. On a finer level they make up what the upsampled coarse reconstruction leaves: with `add`, the regression of that
+remainder on the coarse latent vector; with `concat`, modes of the detail x - U D x beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from surrogates.level import Level
+from surrogates.pod import pod
+from surrogates.reduction import LinearReduction, LinearStart, flat
+
+# Relative to the mean square of a latent number; keeps the regression well posed where two of them agree.
+_RIDGE = 1e-5
+
+
+def pod_start(batches: Iterator[Tensor], count: int, n_nodes: int) -> LinearStart:
+    """POD modes of states (node, b, 3), scaled: decode = V s, encode = V / s with s the RMS of each coefficient.
+
+    Where the states span fewer than `count` directions the other columns are zero.
+    """
+    samples = 0
+
+    def runs() -> Iterator[np.ndarray]:
+        nonlocal samples
+        for x in batches:
+            samples += x.shape[1]
+            yield x.transpose(0, 1).cpu().numpy()
+
+    found = pod(runs(), count)
+    spread = found.singular_values / np.sqrt(samples)
+    encode, decode = torch.zeros(3 * n_nodes, count), torch.zeros(3 * n_nodes, count)
+    known = found.modes.shape[1]
+    if spread[0] > 0:
+        encode[:, :known] = torch.from_numpy(found.modes / spread.astype(np.float32))
+        decode[:, :known] = torch.from_numpy(found.modes * spread.astype(np.float32))
+    return LinearStart(encode, decode, torch.zeros(3 * n_nodes))
+
+
+@torch.no_grad()
+def start_linear_part(level: Level, linear: LinearReduction, batches: Callable[[], Iterator[Tensor]]) -> None:
+    """Compute the linear part `linear` of an untrained `level` from the training states.
+
+    batches  gives the states, some (node, b, 3) at a time, as often as it is called
+    """
+    own = linear.encode_matrix.shape[1]
+    if level.coarse is None:
+        linear.start_at(pod_start(batches(), own, level.n_nodes))
+        return
+    if level.concat:
+        detail = pod_start((x - _interpolated(level, x) for x in batches()), own, level.n_nodes)
+        encode = detail.encode - _back(level, detail.encode)
+        linear.encode_matrix.copy_(encode)
+    linear.decode_matrix.zero_()
+    linear.offset.zero_()
+    product: Tensor | float = 0.0
+    moments: Tensor | float = 0.0
+    count = 0
+    for x in batches():
+        z = level.encode(x)
+        left = flat(x - level.lifted(z)).double()
+        with_one = torch.cat([z, torch.ones_like(z[:, :1])], dim=1).double()
+        moments = moments + with_one.T @ with_one
+        product = product + with_one.T @ left
+        count += len(z)
+    if not isinstance(moments, Tensor) or not isinstance(product, Tensor):
+        return
+    ridge = _RIDGE * torch.diag(moments.diagonal().clamp_min(1e-12))
+    solved = torch.linalg.solve(moments + ridge, product).float()
+    linear.decode_matrix.copy_(solved[:-1].T)
+    linear.offset.copy_(solved[-1])
+
+
+def _interpolated(level: Level, x: Tensor) -> Tensor:
+    """U D x: what interpolation between the coarse nodes already gives."""
+    return level.upsampling(x[level.in_finer])  # type: ignore[misc]
+
+
+def _back(level: Level, matrix: Tensor) -> Tensor:
+    """(U D)^T times the columns of `matrix` (3 * node, r): with it, encode^T (x - U D x) = (encode - back)^T x."""
+    up = level.upsampling.as_matrix()  # type: ignore[union-attr]
+    fields = matrix.reshape(level.n_nodes, -1)
+    out = torch.zeros_like(fields)
+    out[level.in_finer] = up.T @ fields
+    return out.reshape(matrix.shape)

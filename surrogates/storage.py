@@ -1,0 +1,250 @@
+"""A surrogate as a folder: weights, settings, scaling, ranges, the hierarchy it needs, its history and its card.
+
+    model.json             what it is; SHA-256 of every other file, and of itself
+    level_3.safetensors .. weights of each level (pod.safetensors for POD regressions)
+    graphs.safetensors     the levels' graphs and maps, and the full mesh, so that it lifts and draws without the data
+    history.json           losses by epoch and level
+    card.md                for people
+
+Nothing in it is executed when it is loaded. It is written beside its place and moved there when it is complete.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from scipy import sparse
+from torch import Tensor
+
+from surrogates.card import card
+from surrogates.cascade import Cascade, build_level
+from surrogates.config import Settings, parse
+from surrogates.data import GraphLevel
+from surrogates.errors import ModelFolderError, SurrogateError
+from surrogates.graphs import Graphs
+from surrogates.inputs import InputScaling
+from surrogates.model import Record, Surrogate, record_as_dict, record_from_dict
+from surrogates.pod_regression import PodRegression
+
+FORMAT = 1
+_MAIN = "model.json"
+
+
+def save(surrogate: Surrogate, folder: str | Path, *, overwrite: bool = False) -> Path:
+    """Write `surrogate` as `folder`; with `overwrite` an older model there is replaced once the new one is complete.
+
+    Raises ModelFolderError if something stands there already or the place cannot be written.
+    """
+    folder = Path(folder)
+    refuse_other(folder, overwrite)
+    try:
+        with _beside(folder) as part:
+            _write(surrogate, part)
+    except OSError as error:
+        raise ModelFolderError(
+            f"{folder}: cannot be written ({error.strerror or error}); check permissions and free space"
+        ) from error
+    return folder
+
+
+def refuse_other(folder: Path, overwrite: bool) -> None:
+    """Raise ModelFolderError if saving to `folder` would destroy something: anything but a model to be replaced."""
+    if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not (folder / _MAIN).exists()):
+        raise ModelFolderError(f"{folder}: is there already and is no model folder; choose another name")
+    if (folder / _MAIN).exists() and not overwrite:
+        raise ModelFolderError(f"{folder}: holds a model already; choose another name, or overwrite it")
+
+
+def load(folder: str | Path) -> Surrogate:
+    """The surrogate in `folder`; needs nothing else.
+
+    Raises ModelFolderError naming the file that is missing, was altered, or does not fit.
+    """
+    folder = Path(folder)
+    about = _about(folder)
+    for name, digest in about["files"].items():
+        path = folder / name
+        if not path.is_file():
+            raise ModelFolderError(f"{path}: is missing; copy the whole model folder again")
+        if _sha256(path.read_bytes()) != digest:
+            raise ModelFolderError(f"{path}: was altered after training; copy the model folder again, or train anew")
+    try:
+        settings = parse(about["settings"], f"{folder / _MAIN}: settings")
+        histories = json.loads((folder / "history.json").read_text(encoding="utf-8"))
+        record = record_from_dict(about["record"], {int(k): v for k, v in histories.items()})
+        graphs, points, faces = _graphs(load_file(folder / "graphs.safetensors"))
+        core = _core(folder, about, settings, record, graphs)
+    except ModelFolderError:
+        raise
+    except (SurrogateError, SafetensorError, KeyError, TypeError, ValueError, IndexError) as error:
+        raise ModelFolderError(f"{folder}: does not hold together ({error}); train it again") from error
+    return Surrogate(settings, record, graphs, core, points, faces)
+
+
+def _write(surrogate: Surrogate, folder: Path) -> None:
+    record, core = surrogate.record, surrogate.core
+    for stem, tensors in core.tensors().items():
+        save_file({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, folder / f"{stem}.safetensors")
+    save_file(_graph_tensors(surrogate), folder / "graphs.safetensors")
+    histories = {str(k): {n: _plain(v) for n, v in f.history.items()} for k, f in record.fits.items()}
+    (folder / "history.json").write_text(json.dumps(histories), encoding="utf-8")
+    (folder / "card.md").write_text(card(surrogate), encoding="utf-8")
+    for path in folder.iterdir():  # safetensors writes for the owner alone
+        path.chmod(0o644)
+    about: dict[str, Any] = {
+        "format": FORMAT,
+        "settings": surrogate.settings.as_dict(),
+        "record": _plain(record_as_dict(record)),
+        "levels": [
+            {"number": k, "name": name, "nodes": surrogate.graphs.n_nodes(k), "scale": _scale(core, k)}
+            for name, k in surrogate.level_names.items()
+        ],
+        "files": {path.name: _sha256(path.read_bytes()) for path in sorted(folder.iterdir())},
+    }
+    about["sha256"] = _sha256(_canonical(about))
+    (folder / _MAIN).write_text(json.dumps(about, indent=1), encoding="utf-8")
+
+
+def _about(folder: Path) -> dict[str, Any]:
+    path = folder / _MAIN
+    if not folder.exists():
+        raise ModelFolderError(f"{folder}: no such model folder; crashkit train makes one")
+    if not path.is_file():
+        raise ModelFolderError(f"{folder}: holds no {_MAIN}; expected a model folder made by crashkit train")
+    try:
+        about = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ModelFolderError(f"{path}: is no JSON ({error}); copy the model folder again") from error
+    if not isinstance(about, dict) or "format" not in about:
+        raise ModelFolderError(f"{path}: is no model description; expected a model folder made by crashkit train")
+    if about["format"] != FORMAT:
+        raise ModelFolderError(
+            f"{path}: has format {about['format']}, this crashkit reads {FORMAT}; use the crashkit that wrote it ({_writer(about)})"
+        )
+    digest = about.pop("sha256", None)
+    if digest != _sha256(_canonical(about)):
+        raise ModelFolderError(f"{path}: was altered after training; copy the model folder again, or train anew")
+    return about
+
+
+def _core(
+    folder: Path, about: Mapping[str, Any], settings: Settings, record: Record, graphs: Graphs
+) -> Cascade | PodRegression:
+    if settings.model in ("pod-gpr", "pod-rbf"):
+        return PodRegression.load(load_file(folder / "pod.safetensors"), settings.model, record.choice["inputs"])
+    cascade = Cascade(InputScaling(record.ranges, products=settings.inputs.products, angles=settings.inputs.angles))
+    for entry in about["levels"]:
+        level = build_level(entry["number"], settings, graphs, cascade)
+        level.scale = float(entry["scale"])
+        level.load_own_state(load_file(folder / f"level_{entry['number']}.safetensors"))
+        cascade.add(entry["number"], level)
+    return cascade
+
+
+def _scale(core: Cascade | PodRegression, number: int) -> float:
+    return core.levels[number].scale if isinstance(core, Cascade) else 1.0
+
+
+def _graph_tensors(surrogate: Surrogate) -> dict[str, Tensor]:
+    graphs = surrogate.graphs
+    arrays: dict[str, NDArray] = {"nodes": np.array([graphs.n_full])}
+    if surrogate.points is not None and surrogate.faces is not None:
+        arrays |= {"points": np.asarray(surrogate.points, np.float64), "faces": np.asarray(surrogate.faces, np.int32)}
+    numbers = surrogate.core.numbers
+    if 0 in numbers and isinstance(surrogate.core, Cascade) and graphs.full_edges is not None:
+        arrays["edges"] = graphs.full_edges
+    for level in graphs.levels[: max(numbers, default=0)]:
+        prefix = f"level_{level.index}."
+        for name in ("kept", "faces", "edges", "in_finer"):
+            arrays[prefix + name] = getattr(level, name)
+        for name in ("to_finer", "to_full"):
+            matrix = sparse.csr_matrix(getattr(level, name))
+            arrays[f"{prefix}{name}.data"] = matrix.data.astype(np.float64)
+            arrays[f"{prefix}{name}.indices"] = matrix.indices.astype(np.int32)
+            arrays[f"{prefix}{name}.indptr"] = matrix.indptr.astype(np.int64)
+    return {k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in arrays.items()}
+
+
+def _graphs(tensors: Mapping[str, Tensor]) -> tuple[Graphs, NDArray[np.float64] | None, NDArray[np.int32] | None]:
+    a = {k: v.numpy() for k, v in tensors.items()}
+    n_full = int(a["nodes"][0])
+    levels: list[GraphLevel] = []
+    finer = n_full
+    while f"level_{len(levels) + 1}.kept" in a:
+        prefix = f"level_{len(levels) + 1}."
+        kept = a[prefix + "kept"]
+
+        def csr(name: str, rows: int, columns: int, prefix: str = prefix) -> sparse.csr_matrix:
+            parts = tuple(a[f"{prefix}{name}.{p}"] for p in ("data", "indices", "indptr"))
+            return sparse.csr_matrix(parts, shape=(rows, columns))
+
+        levels.append(
+            GraphLevel(
+                len(levels) + 1, kept, a[prefix + "faces"], a[prefix + "edges"], a[prefix + "in_finer"],
+                csr("to_finer", finer, len(kept)), csr("to_full", n_full, len(kept)),
+            )
+        )  # fmt: skip
+        finer = len(kept)
+    return Graphs(n_full, tuple(levels), a.get("edges")), a.get("points"), a.get("faces")
+
+
+@contextmanager
+def _beside(folder: Path) -> Iterator[Path]:
+    """A fresh folder that takes the place of `folder` at the end, or is thrown away."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    part = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    part.chmod(0o755)
+    try:
+        yield part
+        if folder.exists():
+            old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+            folder.replace(old)
+            part.replace(folder)
+            shutil.rmtree(old, ignore_errors=True)
+        else:
+            part.replace(folder)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _plain(value: Any) -> Any:
+    """Values JSON has: no numpy, and null for what is not finite."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _canonical(about: Mapping[str, Any]) -> bytes:
+    return json.dumps(about, sort_keys=True).encode()
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _writer(about: Mapping[str, Any]) -> str:
+    try:
+        return f"crashkit {about['record']['versions']['crashkit']}"
+    except (KeyError, TypeError):
+        return "unknown version"

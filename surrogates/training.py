@@ -1,0 +1,339 @@
+"""The training loop: one objective, one optimiser, epochs until done; best weights kept, every epoch told.
+
+Nothing in the loop asks the device for a number: losses add up where they are computed and are read once an epoch. The
+order of samples in an epoch follows from seed and epoch alone, so a resumed training goes on as if nothing happened.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from surrogates.config import LevelSettings
+from surrogates.errors import Diverged, SurrogateError
+
+HISTORY = (
+    "total", "approximation", "reconstruction",
+    "validation_total", "validation_approximation", "validation_reconstruction",
+    "learning_rate",
+)  # fmt: skip
+
+
+class Objective(nn.Module):
+    """A network and the samples it is trained on; subclasses say what one batch costs.
+
+    `forward(index)` gives the losses (2,) of training samples `index`: approximation and reconstruction, unweighted.
+    """
+
+    size: int
+
+    def validation(self) -> Tensor | None:
+        """Losses (2,) over the validation samples; None where there are none."""
+        raise NotImplementedError
+
+    def networks(self) -> dict[str, nn.Module]:
+        """What is trained, by name; their tensors are what best weights and checkpoints hold."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """What is told after each epoch. Losses are unweighted parts and their weighted total; `rate` is epochs a second."""
+
+    name: str
+    epoch: int
+    epochs: int
+    total: float
+    approximation: float
+    reconstruction: float
+    validation: float
+    best_epoch: int
+    learning_rate: float
+    rate: float
+    seconds_left: float
+
+
+@dataclass
+class Fit:
+    """How a training went. `best_epoch` counts from 1; `history` has one value an epoch (HISTORY)."""
+
+    history: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in HISTORY})
+    best_epoch: int = 0
+    best: float = math.inf
+    seconds: float = 0.0
+    status: Literal["finished", "interrupted", "diverged"] = "finished"
+
+    @property
+    def epochs(self) -> int:
+        return len(self.history["total"])
+
+    @property
+    def seconds_per_epoch(self) -> float:
+        return self.seconds / self.epochs if self.epochs else math.nan
+
+
+class Keeper(Protocol):
+    """Where a training's state goes between epochs; see `surrogates.checkpoints`."""
+
+    def load(self, name: str) -> tuple[dict[str, Tensor], dict[str, Any]] | None: ...
+
+    def due(self, epoch: int) -> bool: ...
+
+    def save(self, name: str, tensors: dict[str, Tensor], about: dict[str, Any]) -> None: ...
+
+
+def fit(
+    objective: Objective,
+    settings: LevelSettings,
+    *,
+    name: str,
+    seed: int,
+    precision: str = "float32",
+    report: Callable[[Epoch], None] | None = None,
+    keeper: Keeper | None = None,
+) -> Fit:
+    """Train what `objective` holds and leave the weights of its best epoch in place.
+
+    Samples that do not fill a batch are left out of an epoch, other ones each time. Under torchrun each process takes
+    its share of every batch, so the losses are those of one process with the same `settings.batch`.
+
+    Raises Diverged, with the best weights so far in place and the history on it, if a loss is not finite.
+    KeyboardInterrupt ends the training early with status "interrupted" once an epoch is done.
+    """
+    device = next(objective.parameters()).device
+    plan = _Plan(objective.size, settings, seed, device)
+    trained = [p for p in objective.parameters() if p.requires_grad]
+    optimiser = _optimiser(trained, settings, device)
+    names = _names(objective)
+    out = Fit()
+    best: dict[str, Tensor] = {}
+    if keeper is not None and (stored := keeper.load(name)) is not None:
+        best = _restore(stored, names, optimiser, trained, out)
+    weights = torch.tensor([settings.weight_approximation, settings.weight_reconstruction], device=device)
+    step = _Step(_distributed(objective), optimiser, weights, settings.clip, precision)
+    started, spent = time.perf_counter(), out.seconds
+    try:
+        for epoch in range(out.epochs, settings.epochs):
+            sums = torch.zeros(2, device=device)
+            for indices, rate in plan.batches(epoch):
+                sums += step(indices, rate)
+            measured = _measured(objective, sums / plan.steps, weights)
+            out.seconds = spent + time.perf_counter() - started
+            if not all(map(math.isfinite, measured[:3])):
+                out.status = "diverged"
+                raise _diverged(name, epoch, out)
+            for key, value in zip(HISTORY, (*measured, rate), strict=True):
+                out.history[key].append(value)
+            judged = measured[0] if math.isnan(measured[3]) else measured[3]
+            if judged < out.best:
+                out.best, out.best_epoch = judged, epoch + 1
+                best = {k: v.detach().clone() for k, v in names.items()}
+            if report is not None and plan.rank == 0:
+                report(_told(name, settings.epochs, out))
+            if keeper is not None and plan.rank == 0 and (keeper.due(epoch + 1) or epoch + 1 == settings.epochs):
+                keeper.save(name, _tensors(names, best, optimiser, trained), _about(out))
+    except KeyboardInterrupt:
+        if not best:
+            raise
+        out.status = "interrupted"
+    finally:
+        with torch.no_grad():
+            for key, kept in best.items():
+                names[key].copy_(kept)
+    return out
+
+
+def set_up(seed: int, precision: str) -> None:
+    """Seed torch and choose the precision of matrix products."""
+    torch.manual_seed(seed)
+    torch.set_float32_matmul_precision("high" if precision in ("tf32", "bfloat16") else "highest")
+
+
+def device_of(choice: str) -> torch.device:
+    """The device called cpu, cuda, mps, or the best there is for auto; raises SurrogateError if it is not there."""
+    there = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+    if choice == "auto":
+        choice = next(k for k in ("cuda", "mps", "cpu") if there[k])
+    if choice.split(":")[0] not in there:
+        raise SurrogateError(f"device {choice!r} is not known; choose cpu, cuda, mps or auto")
+    if not there[choice.split(":")[0]]:
+        raise SurrogateError(
+            f"device {choice!r} is not there; this machine has {', '.join(k for k in there if there[k])}"
+        )
+    if choice == "cuda" and torch.distributed.is_initialized():
+        choice = f"cuda:{torch.distributed.get_rank() % torch.cuda.device_count()}"
+    return torch.device(choice)
+
+
+def learning_rates(settings: LevelSettings, steps: int) -> NDArray[np.float64]:
+    """The rate of every step (steps,).
+
+    one_cycle rises from a tenth over the first tenth of the steps and falls to a thousandth along a cosine (after
+    Smith and Topin 2018); cosine only falls.
+    """
+    top = settings.learning_rate
+    if settings.schedule == "constant":
+        return np.full(steps, top)
+    rise = max(1, steps // 10) if settings.schedule == "one_cycle" else 0
+    up = np.linspace(0.1 * top, top, rise, endpoint=False)
+    low = 1e-3 * top
+    down = low + (top - low) * 0.5 * (1 + np.cos(np.pi * np.linspace(0, 1, max(steps - rise, 1))))
+    return np.concatenate([up, down])[:steps]
+
+
+class _Plan:
+    """Which samples each step takes, and its learning rate."""
+
+    def __init__(self, size: int, settings: LevelSettings, seed: int, device: torch.device) -> None:
+        self.rank, self.processes = _rank_and_size()
+        self.batch = min(settings.batch, size)
+        if self.batch % self.processes:
+            raise SurrogateError(
+                f"a batch of {self.batch} samples cannot be shared by {self.processes} processes; choose a multiple"
+            )
+        self.size, self.seed, self.device = size, seed, device
+        self.steps = size // self.batch
+        self.rates = learning_rates(settings, self.steps * settings.epochs)
+
+    def batches(self, epoch: int) -> Iterator[tuple[Tensor, float]]:
+        generator = torch.Generator().manual_seed((self.seed << 24) + epoch)
+        order = torch.randperm(self.size, generator=generator)[: self.steps * self.batch]
+        share = self.batch // self.processes
+        mine = order.view(self.steps, self.batch)[:, self.rank * share : (self.rank + 1) * share].to(self.device)
+        for k in range(self.steps):
+            yield mine[k], float(self.rates[epoch * self.steps + k])
+
+
+class _Step:
+    """One step of the optimiser; gives the losses (2,) of its batch, still on the device."""
+
+    def __init__(
+        self, objective: nn.Module, optimiser: torch.optim.Optimizer, weights: Tensor, clip: float, precision: str
+    ) -> None:
+        self.objective, self.optimiser, self.weights, self.clip = objective, optimiser, weights, clip
+        self.half = precision == "bfloat16"
+        self.parameters = [p for group in optimiser.param_groups for p in group["params"]]
+
+    def __call__(self, indices: Tensor, rate: float) -> Tensor:
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        self.optimiser.zero_grad(set_to_none=True)
+        with torch.autocast(indices.device.type, torch.bfloat16) if self.half else contextlib.nullcontext():
+            losses = self.objective(indices)
+        (losses * self.weights).sum().backward()
+        if self.clip:
+            nn.utils.clip_grad_norm_(self.parameters, self.clip)
+        self.optimiser.step()
+        return losses.detach()
+
+
+def _optimiser(parameters: list[nn.Parameter], settings: LevelSettings, device: torch.device) -> torch.optim.Optimizer:
+    rate, decay = settings.learning_rate, settings.weight_decay
+    fused = device.type in ("cpu", "cuda")
+    if settings.optimiser == "adamw":
+        return torch.optim.AdamW(parameters, lr=rate, weight_decay=decay, fused=fused)
+    if settings.optimiser == "adam":
+        return torch.optim.Adam(parameters, lr=rate, weight_decay=decay, fused=fused)
+    return torch.optim.SGD(parameters, lr=rate, weight_decay=decay, momentum=0.9, fused=fused)
+
+
+def _measured(objective: Objective, losses: Tensor, weights: Tensor) -> tuple[float, ...]:
+    """Total, approximation, reconstruction of the training and the validation samples (NaN without)."""
+    if torch.distributed.is_initialized():
+        torch.distributed.all_reduce(losses)
+        losses = losses / torch.distributed.get_world_size()
+    with torch.no_grad():
+        validation = objective.validation()
+    parts = [losses] + ([] if validation is None else [validation])
+    numbers = torch.stack([torch.cat([(p * weights).sum()[None], p]) for p in parts]).tolist()
+    return (*numbers[0], *(numbers[1] if len(numbers) > 1 else (math.nan,) * 3))
+
+
+def _distributed(objective: Objective) -> nn.Module:
+    if not torch.distributed.is_initialized():
+        return objective
+    from torch.nn.parallel import DistributedDataParallel
+
+    return DistributedDataParallel(objective, broadcast_buffers=False)
+
+
+def _rank_and_size() -> tuple[int, int]:
+    if not torch.distributed.is_initialized():
+        return 0, 1
+    return torch.distributed.get_rank(), torch.distributed.get_world_size()
+
+
+def _names(objective: Objective) -> dict[str, Tensor]:
+    """The trained tensors by name, live."""
+    return {
+        f"{part}.{key}": value
+        for part, network in objective.networks().items()
+        for key, value in network.named_parameters()
+        if value.requires_grad
+    }
+
+
+def _tensors(
+    names: dict[str, Tensor], best: dict[str, Tensor], optimiser: torch.optim.Optimizer, trained: list[nn.Parameter]
+) -> dict[str, Tensor]:
+    """Everything a training needs to go on, flat."""
+    out = {f"now.{k}": v.detach() for k, v in names.items()} | {f"best.{k}": v for k, v in best.items()}
+    for number, parameter in enumerate(trained):
+        for key, value in optimiser.state.get(parameter, {}).items():
+            if isinstance(value, Tensor):
+                out[f"optimiser.{number}.{key}"] = value.detach()
+    return out
+
+
+def _about(out: Fit) -> dict[str, Any]:
+    return {"history": out.history, "best_epoch": out.best_epoch, "best": out.best, "seconds": out.seconds}
+
+
+def _restore(
+    stored: tuple[dict[str, Tensor], dict[str, Any]],
+    names: dict[str, Tensor],
+    optimiser: torch.optim.Optimizer,
+    trained: list[nn.Parameter],
+    out: Fit,
+) -> dict[str, Tensor]:
+    """Put a stored training back in place; returns the best weights so far."""
+    tensors, about = stored
+    with torch.no_grad():
+        for key, value in names.items():
+            value.copy_(tensors[f"now.{key}"])
+    for number, parameter in enumerate(trained):
+        prefix = f"optimiser.{number}."
+        state = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+        if state:
+            optimiser.state[parameter] = {k: v.clone().to(parameter.device) for k, v in state.items()}
+    out.history, out.best_epoch = about["history"], about["best_epoch"]
+    out.best, out.seconds = about["best"], about["seconds"]
+    device = next(iter(names.values())).device
+    return {k: tensors[f"best.{k}"].to(device) for k in names if f"best.{k}" in tensors}
+
+
+def _told(name: str, epochs: int, out: Fit) -> Epoch:
+    last = {key: values[-1] for key, values in out.history.items()}
+    done = out.epochs
+    return Epoch(
+        name, done, epochs, last["total"], last["approximation"], last["reconstruction"], last["validation_total"],
+        out.best_epoch, last["learning_rate"], done / out.seconds, out.seconds / done * (epochs - done),
+    )  # fmt: skip
+
+
+def _diverged(name: str, epoch: int, out: Fit) -> Diverged:
+    kept = f"the weights of epoch {out.best_epoch} are kept" if out.best_epoch else "no epoch ended well"
+    error = Diverged(
+        f"{name}: the loss is not finite in epoch {epoch + 1}; {kept}. Lower level.learning_rate, or set level.clip=1"
+    )
+    error.fit = out
+    return error
