@@ -112,16 +112,8 @@ def _less(cost: NDArray, tie: NDArray, a: int, b: int) -> bool:
 
 
 @njit(cache=True)
-def _sift(heap: NDArray, where: NDArray, cost: NDArray, tie: NDArray, k: int, size: int) -> None:
-    """Put the entry at place k of the first `size` where it belongs, upwards or downwards."""
+def _sift_down(heap: NDArray, where: NDArray, cost: NDArray, tie: NDArray, k: int, size: int) -> None:
     v = heap[k]
-    while k > 0:
-        up = (k - 1) // 2
-        if not _less(cost, tie, v, heap[up]):
-            break
-        heap[k] = heap[up]
-        where[heap[k]] = k
-        k = up
     while True:
         child = 2 * k + 1
         if child >= size:
@@ -135,6 +127,22 @@ def _sift(heap: NDArray, where: NDArray, cost: NDArray, tie: NDArray, k: int, si
         k = child
     heap[k] = v
     where[v] = k
+
+
+@njit(cache=True)
+def _sift(heap: NDArray, where: NDArray, cost: NDArray, tie: NDArray, k: int, size: int) -> None:
+    """Put the entry at place k of the first `size`, whose cost changed, where it belongs."""
+    v = heap[k]
+    while k > 0:
+        up = (k - 1) // 2
+        if not _less(cost, tie, v, heap[up]):
+            break
+        heap[k] = heap[up]
+        where[heap[k]] = k
+        k = up
+    heap[k] = v
+    where[v] = k
+    _sift_down(heap, where, cost, tie, k, size)
 
 
 @njit(cache=True)
@@ -291,7 +299,7 @@ def contract(
                 v, position, quadric, faces, face_head, face_next, half_to, half_head, half_next, parts, join_parts, flip
             )  # fmt: skip
     for k in range(n // 2, -1, -1):
-        _sift(heap, where, cost, tie, k, n)
+        _sift_down(heap, where, cost, tie, k, n)
 
     left = n
     stamp = 0

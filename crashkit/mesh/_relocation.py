@@ -187,7 +187,7 @@ def relocate(finer: Finer, coarse: Coarse, chosen: NDArray, radius: float, sweep
                         )
                         if c_d2 < x_d2:
                             x_d2, x_cost = c_d2, c_cost
-                    total += finer.weight[x] * x_cost
+                    total += finer.weight[x] * x_cost * x_cost
                     if total >= best_total:
                         break
                 # Less by a hair is rounding; moving for it would make the result depend on it.

@@ -8,6 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.mesh.levels import Hierarchy, Level
+from crashkit.readers.base import split_states
+
+# Bytes of displacement lifted at once.
+_BUDGET = 32 << 20
 
 
 @dataclass(frozen=True)
@@ -29,12 +33,14 @@ class LiftingMeter:
 
     def add(self, displacement: NDArray[np.floating]) -> None:
         """Take in displacements (state, node of level 0, 3), m. Nodes that are NaN before or after are left out."""
-        for k, level in enumerate(self._levels):
-            error = np.linalg.norm(lift(level, displacement[:, level.kept]) - displacement, axis=-1)
-            there = np.isfinite(error)
-            self._sum[k] += error[there].sum(dtype=np.float64)
-            self._count[k] += there.sum()
-            self._largest[k] = max(self._largest[k], error[there].max(initial=0.0))
+        for begin, end in split_states(len(displacement), displacement.shape[1], _BUDGET):
+            block = displacement[begin:end]
+            for k, level in enumerate(self._levels):
+                error = np.linalg.norm(lift(level, block[:, level.kept]) - block, axis=-1)
+                there = np.isfinite(error)
+                self._sum[k] += error[there].sum(dtype=np.float64)
+                self._count[k] += there.sum()
+                self._largest[k] = max(self._largest[k], error[there].max(initial=0.0))
 
     @property
     def errors(self) -> list[LiftingError]:

@@ -152,7 +152,8 @@ def _start(mesh: Surface, base: Selection, boundary: float, spread: float) -> tu
     faces = faces[np.arange(len(faces))[:, None], (turn[:, None] + np.arange(3)) % 3]
     sorted_faces = np.lexsort((base.part, faces[:, 2], faces[:, 1], faces[:, 0]))
     faces = np.ascontiguousarray(faces[sorted_faces])
-    edges = unique_pairs(new[base.edges])
+    # The diagonals of quadrilaterals join in: from here on everything is triangles.
+    edges = unique_pairs(np.concatenate([new[base.edges], faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)]))
     at = mesh.position[nodes]
     at = (at - (at.max(axis=0) + at.min(axis=0)) / 2) / _scale(mesh)
     state = _State(

@@ -22,16 +22,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from crashkit.dataset import open_dataset
+from crashkit.dataset import open_dataset, reading
 from crashkit.errors import DataError, OutputError, ReadError
 from crashkit.mesh.levels import Hierarchy, Level
 from crashkit.mesh.lifting import LiftingError, LiftingMeter
+from crashkit.readers.base import split_states
 
 if TYPE_CHECKING:
     import xarray as xr
 
-# Bytes of displacement held at once while streaming.
-_BUDGET = 128 << 20
+# Bytes of displacement held at once while streaming: mostly a whole run, since its chunks hold all states.
+_BUDGET = 512 << 20
 
 
 def write_hierarchy(
@@ -45,7 +46,7 @@ def write_hierarchy(
     Raises DataError if the hierarchy is not one of this dataset's mesh, OutputError if `path` cannot be written.
     """
     path = Path(path)
-    with open_dataset(path) as dataset:
+    with open_dataset(path, chunks=None) as dataset:
         if dataset.sizes["node"] != hierarchy.n_nodes:
             raise DataError(
                 f"{path}: has {dataset.sizes['node']} nodes, but the hierarchy was made for a mesh of "
@@ -61,7 +62,7 @@ def write_hierarchy(
         try:
             with _target(path) as target:
                 target.group("hierarchy", about)
-                errors = _stream(dataset, hierarchy, target, progress)
+                errors = _stream(path, dataset, hierarchy, target, progress)
                 for level, error in zip(hierarchy.levels, errors, strict=True):
                     _write_level(target, level, error)
         except OSError as error:
@@ -176,19 +177,12 @@ class MeshArrays:
 def open_mesh(path: Path) -> MeshArrays:
     """The mesh of the dataset at `path`; where the runs differ in shape, the one of the first run.
 
-    Raises ReadError if the file is no dataset, DataError if it holds no mesh.
+    Raises ReadError if the file is no crash dataset or lacks its faces.
     """
-    names = ("reference_position", "face_nodes", "face_part", "node_id", "part_id")
-    with open_dataset(path) as dataset:
-        missing = [name for name in names if name not in dataset]
-        if missing:
-            raise DataError(
-                f"{path}: has no {missing[0]}; a mesh hierarchy needs a crash dataset with faces, "
-                "made by crashkit ingest"
-            )
+    with open_dataset(path, chunks=None) as dataset:
         at = dataset["reference_position"]
         at = at.isel(sim=0) if "sim" in at.dims else at
-        others = (dataset[name].values for name in names[1:])
+        others = (dataset[name].values for name in ("face_nodes", "face_part", "node_id", "part_id"))
         return MeshArrays(np.asarray(at.values, np.float64), *others)
 
 
@@ -214,7 +208,7 @@ def _open_level(path: Path, index: int) -> Iterator[xr.Dataset]:
 
 def _about(path: Path) -> dict[str, Any]:
     """Attributes of /hierarchy, checked against the dataset around it; `nodes` is added."""
-    with open_dataset(path) as dataset:
+    with open_dataset(path, chunks=None) as dataset:
         try:
             with _open_group(path, "hierarchy") as group:
                 about = dict(group.attrs)
@@ -230,11 +224,13 @@ def _about(path: Path) -> dict[str, Any]:
 
 
 def _stream(
-    dataset: xr.Dataset, hierarchy: Hierarchy, target: _Target, progress: Callable[[int, int], None] | None
+    path: Path,
+    dataset: xr.Dataset,
+    hierarchy: Hierarchy,
+    target: _Target,
+    progress: Callable[[int, int], None] | None,
 ) -> list[LiftingError]:
     """One pass over the fine field: the displacements of level 1 go out, lifting errors add up."""
-    from crashkit.readers.base import split_states
-
     meter = LiftingMeter(hierarchy)
     first = hierarchy.levels[0]
     runs, states = dataset.sizes["sim"], dataset.sizes["time"]
@@ -244,7 +240,8 @@ def _stream(
     )  # fmt: skip
     for run in range(runs):
         for begin, end in split_states(states, hierarchy.n_nodes, _BUDGET):
-            block = dataset["displacement"].isel(sim=run, time=slice(begin, end)).values
+            with reading(path):
+                block = dataset["displacement"].isel(sim=run, time=slice(begin, end)).values
             meter.add(block)
             write(run, begin, end, block[:, first.kept].astype(np.float32))
         if progress:
