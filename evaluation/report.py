@@ -100,7 +100,7 @@ def write_report(
         text=_TEXT,
         methods=[*evaluation.context.items(), *([("Left out", left_out)] if left_out else [])],
         details=_details(evaluation),
-        tables=_tables(performance, all_tables),
+        tables=[*_tables(performance, all_tables), *_file_table(evaluation, folder)],
     )
     numbers = {
         "performance": [asdict(row) for row in rows],
@@ -185,6 +185,12 @@ def _tables(performance: Columns, all_tables: Mapping[str, Columns]) -> list[Sho
         show_table("Every test run", all_tables["runs"], "Mean node error over nodes and time, cm."),
         show_table("What each run was used for", all_tables["split"]),
     ]
+
+
+def _file_table(evaluation: Evaluation, folder: Path) -> list[ShownTable]:
+    """Where the ParaView files lie, seen from the page."""
+    inside = [p.relative_to(folder).as_posix() for p in evaluation.files if p.is_relative_to(folder)]
+    return [show_table("Files for ParaView", {"file": inside})] if inside else []
 
 
 def _details(evaluation: Evaluation) -> list[tuple[str, str]]:

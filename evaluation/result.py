@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,6 +40,7 @@ class Evaluation:
     context   name -> text for the methods section: data, split, versions, machine
     group_names  grouping -> name of each group
     sensors   where histories were taken; None without
+    files     ParaView files written of it (evaluation.files.write_run)
     """
 
     reference: Reference
@@ -52,6 +54,7 @@ class Evaluation:
     group_names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     context: Mapping[str, str] = field(default_factory=dict)
     sensors: Sensors | None = None
+    files: tuple[Path, ...] = ()
 
     @property
     def test_names(self) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import functools
+import dataclasses
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from crashkit.cli._console import print_json, progress, say, table
+from crashkit.cli._console import fail, print_json, progress, say, table
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from evaluation.predictor import Model
+    from evaluation.predictor import Mesh, Model
     from evaluation.reference import Reference
     from evaluation.result import Evaluation
     from evaluation.scoring import RunScores
-    from surrogates.data import GraphLevel
+    from evaluation.sensors import Sensors
     from surrogates.model import Surrogate
 
 Progress = Callable[[str, int, int], None]  # what is being done, steps done, steps in all
@@ -37,6 +37,8 @@ def evaluate(
     test: Sequence[str] | None = None,
     write_vtu: bool = False,
     vtk_runs: Sequence[str] | None = None,
+    probes: Sequence[int] | None = None,
+    intrusion: tuple[str, str] | None = None,
     workers: int = 1,
     scheduler: str | None = None,
     seeds_as_spread: bool = True,
@@ -49,6 +51,8 @@ def evaluate(
     test       names of the test runs; default: those that all the models hold out
     write_vtu  also write PVD + VTU and VTKHDF with truth, prediction and error
     vtk_runs   the runs written so; default: the worst and the median run of the best model
+    probes     the solver's numbers of nodes whose histories are compared; default: four spread over the structure
+    intrusion  name of a part and a direction (x, -x, y, -y, z or -z); default: the whole structure, against its motion
     workers    processes that share the runs; `scheduler`, the address of a Dask scheduler, is used instead
     report     called with what is being done and how far it is
 
@@ -59,38 +63,51 @@ def evaluate(
     written.
     """
     from evaluation.comparison import agree_on_split, entries
+    from evaluation.figures import ORDER
+    from evaluation.files import default_runs, write_run
     from evaluation.output import complete_folder
     from evaluation.report import write_report
     from evaluation.result import compare, decompose
+    from evaluation.sensors import choose_sensors
     from evaluation.streaming import over_runs
 
     tell = report or (lambda what, done, total: None)
-    reference, stored = _opened(str(dataset), tuple(map(str, models)))
+    paths = (str(dataset), tuple(map(str, models)))
+    reference, stored = _opened(*paths)
     split = agree_on_split(reference, stored, test)
     entries(stored, seeds_as_spread)  # refuses what cannot be compared before anything is computed
-    _check_runs(reference, vtk_runs)
+    reference.index(vtk_runs or ())
+    sensors = choose_sensors(reference, probes, intrusion)
     with complete_folder(Path(output), "report.json") as folder:
         with _counted(tell, "modes of the training runs", len(split.train)) as step:
             pods = decompose(reference, split.train, done=step)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".modes-") as kept:
-            job = ScoreJob(str(dataset), tuple(map(str, models)), _keep_modes(pods, Path(kept)))
+            job = ScoreJob(*paths, _keep_modes(pods, Path(kept)), sensors)
+            _HELD[job.modes[0]] = (reference, stored)  # what is open here need not be opened again
             with _counted(tell, "test runs", len(split.test)) as step:
-                scored = over_runs(job, split.test, workers, scheduler, done=step)
+                try:
+                    scored = over_runs(job, split.test, workers, scheduler, done=step)
+                finally:
+                    _HELD.clear()
         result = compare(
             reference, stored, split, seeds_as_spread=seeds_as_spread, pods=pods, scored=scored,
-            context=_context(Path(dataset), reference, stored, split),
+            sensors=sensors, context=_context(Path(dataset), reference, stored, split),
         )  # fmt: skip
-        with _counted(tell, "figures", None) as step:
-            write_report(result, folder, done=lambda name: step(0))
         if write_vtu:
-            from evaluation.files import default_runs, write_run
-
             runs = reference.index(vtk_runs) if vtk_runs else default_runs(result)
             with _counted(tell, "runs for ParaView", len(runs)) as step:
+                written = []
                 for run in runs:
-                    write_run(result, run, folder / "vtk")
+                    written += write_run(result, run, folder / "vtk")
                     step(run)
+            result = dataclasses.replace(result, files=tuple(written))
+        with _counted(tell, "figures", len(ORDER)) as step:
+            write_report(result, folder, done=lambda name: step(0))
     return result
+
+
+# Evaluation -> its dataset and models, opened once a process.
+_HELD: dict[str, tuple[Reference, tuple[Model, ...]]] = {}
 
 
 @dataclass(frozen=True)
@@ -100,6 +117,7 @@ class ScoreJob:
     dataset: str
     models: tuple[str, ...]
     modes: Mapping[int, str]
+    sensors: Sensors
 
     def __call__(self, run: int) -> RunScores:
         import numpy as np
@@ -107,9 +125,13 @@ class ScoreJob:
         from evaluation.result import default_groups, predictors_of
         from evaluation.scoring import score_run
 
-        reference, models = _opened(self.dataset, self.models)
+        evaluation = self.modes[0]  # a folder of its own, so its path names the evaluation
+        if evaluation not in _HELD:
+            _HELD.clear()
+            _HELD[evaluation] = _opened(self.dataset, self.models)
+        reference, models = _HELD[evaluation]
         modes = {level: np.load(path, mmap_mode="r", allow_pickle=False) for level, path in self.modes.items()}
-        return score_run(reference, predictors_of(models), run, modes, default_groups(reference)[0])
+        return score_run(reference, predictors_of(models), run, modes, default_groups(reference)[0], self.sensors)
 
 
 def _keep_modes(pods: Mapping[int, Any], folder: Path) -> dict[int, str]:
@@ -124,7 +146,6 @@ def _keep_modes(pods: Mapping[int, Any], folder: Path) -> dict[int, str]:
     return out
 
 
-@functools.lru_cache(maxsize=2)
 def _opened(dataset: str, models: tuple[str, ...]) -> tuple[Reference, tuple[Model, ...]]:
     """The dataset and the models as evaluation sees them."""
     from crashkit.cli.predict import load_model
@@ -155,7 +176,7 @@ class StoredLevel:
     surrogate: Surrogate
     name: str
     level: int
-    mesh: GraphLevel | None
+    mesh: Mesh | None
     order: tuple[int, ...]
     n_parameters: int
     n_latent: int
@@ -216,7 +237,7 @@ def as_model(surrogate: Surrogate, folder: Path, reference: Reference) -> Model:
     )
 
 
-def _own_mesh(surrogate: Surrogate, folder: Path, name: str, level: int, reference: Reference) -> GraphLevel | None:
+def _own_mesh(surrogate: Surrogate, folder: Path, name: str, level: int, reference: Reference) -> Mesh | None:
     """The level's own mesh where training refined it; None where it is the dataset's."""
     import numpy as np
 
@@ -244,10 +265,6 @@ def _counted(tell: Progress, what: str, total: int | None) -> Iterator[Callable[
 
     tell(what, 0, total or 0)
     yield step
-
-
-def _check_runs(reference: Reference, names: Sequence[str] | None) -> None:
-    reference.index(names or ())
 
 
 def _context(dataset: Path, reference: Reference, models: Sequence[Model], split: Any) -> dict[str, str]:
@@ -305,6 +322,12 @@ def command(
     vtk_runs: Annotated[
         str, typer.Option(help="Runs written for ParaView.", show_default="the worst and the median of the best model")
     ] = "",
+    probes: Annotated[
+        str, typer.Option(help="Nodes whose histories are compared: 12,340.", show_default="four, spread out")
+    ] = "",
+    intrusion: Annotated[
+        str, typer.Option(help="Part and direction: floor:-x.", show_default="the structure, against its motion")
+    ] = "",
     workers: Annotated[int, typer.Option(min=1, help="Processes that share the test runs.")] = 1,
     scheduler: Annotated[str, typer.Option(help="Address of a Dask scheduler instead.", show_default="none")] = "",
     seeds_as_spread: Annotated[
@@ -317,6 +340,7 @@ def command(
 
     from crashkit.dataset import open_dataset
     from evaluation.tables import performance
+    from evaluation.verdict import statements
 
     names = tuple(map(str, open_dataset(dataset)["sim"].values)) if test or vtk_runs else ()
     with progress() as bar:
@@ -334,6 +358,8 @@ def command(
             test=_named(names, test) if test else None,
             write_vtu=write_vtu,
             vtk_runs=_named(names, vtk_runs if ":" in vtk_runs else vtk_runs.split(",")) if vtk_runs else None,
+            probes=_node_numbers(probes) if probes else None,
+            intrusion=_part_and_direction(intrusion) if intrusion else None,
             workers=workers, scheduler=scheduler or None, seeds_as_spread=seeds_as_spread, report=follow,
         )  # fmt: skip
     rows = performance(result)
@@ -342,21 +368,24 @@ def command(
         return
     several = any(row.seeds > 1 for row in rows)
     table(
-        f"Mean node error on {len(result.runs)} test runs, on the full mesh",
+        f"Mean node error of {len(result.runs)} test runs on the full mesh, cm",
         (
-            "model", "nodes", "error (cm)", *(["± seeds"] if several else []), "relative", "worst run (cm)",
-            "reduction (cm)", "POD floor (cm)", "parameters", "training (s)", "ms a state",
+            "model", "nodes", "error", *(["± seeds"] if several else []), "% of motion", "worst run", "reduction",
+            "POD floor", "train s", "ms/state",
         ),
         (
             (
                 r.model, r.nodes, f"{r.error_cm:.3f}", *([f"{r.spread_cm:.3f}"] if several else []),
-                f"{100 * r.relative:.1f} %", f"{r.worst_run_cm:.2f} ({r.worst_run})", f"{r.reduction_cm:.3f}",
-                f"{r.pod_floor_cm:.3f}", r.parameters, _or_dash(r.training_s, ".1f"),
-                _or_dash(r.prediction_lifted_ms, ".3g"),
+                f"{100 * r.relative:.1f}", f"{r.worst_run_cm:.2f}", f"{r.reduction_cm:.3f}", f"{r.pod_floor_cm:.3f}",
+                _or_dash(r.training_s, ".0f"), _or_dash(r.prediction_lifted_ms, ".2g"),
             )
             for r in rows
         ),
     )  # fmt: skip
+    for said in statements(result):
+        if said.kind == "use":
+            say(f"  {said.about}: {said.text}")
+    say("")
     for path in (output / "report.html", output / "report.json", *sorted((output / "vtk").glob("*.pvd"))):
         say(f"  {path}")
 
@@ -366,6 +395,20 @@ def _named(names: Sequence[str], chosen: str | list[str]) -> list[str]:
     from crashkit.dataset import runs_of
 
     return [names[k] for k in runs_of(names, chosen)]
+
+
+def _node_numbers(text: str) -> list[int]:
+    try:
+        return [int(piece) for piece in text.split(",")]
+    except ValueError:
+        fail(f"--probes {text!r} not understood; expected node numbers with commas, such as 12,340", code=2)
+
+
+def _part_and_direction(text: str) -> tuple[str, str]:
+    part, colon, direction = text.rpartition(":")
+    if not colon or not part:
+        fail(f"--intrusion {text!r} not understood; expected a part and a direction, such as floor:-x", code=2)
+    return part, direction
 
 
 def _or_dash(value: float, form: str) -> str:

@@ -37,6 +37,7 @@ ORDER = (
     "singular_values",
     "coverage",
     "meshes",
+    "paraview",
 )
 
 __all__ = ["ORDER", "Drawing", "Kind", "Sheet", "drawings", "kinds", "styles"]

@@ -17,11 +17,12 @@ from evaluation.comparison import Split, agree_on_split
 from evaluation.figures import ORDER, drawings, kinds, sheet_of
 from evaluation.figures.kind import drawn, image
 from evaluation.figures.style import Sheet, readable, smoothed, styles
+from evaluation.files import write_run
 from evaluation.page import plain
 from evaluation.report import write_report
 from evaluation.result import compare
 
-PICTURES = ("worst", "map", "contributions", "meshes")
+PICTURES = ("worst", "map", "contributions", "meshes", "paraview")
 
 
 class _Page(HTMLParser):
@@ -61,7 +62,9 @@ def parsed(path: Path) -> _Page:
 def report(evaluation, tmp_path_factory) -> Iterator[Path]:
     with pytest.MonkeyPatch.context() as small:  # software rendering of large pictures takes most of a minute
         small.setattr("evaluation.pictures.PIXELS_PER_CM", 12)
-        yield write_report(evaluation, tmp_path_factory.mktemp("report"), view=False)
+        folder = tmp_path_factory.mktemp("report")
+        files = write_run(evaluation, 9, folder / "vtk")
+        yield write_report(replace(evaluation, files=tuple(files)), folder, view=False)
 
 
 def test_every_figure_is_there_three_times(report):

@@ -1,0 +1,68 @@
+"""A state of the files written for ParaView, read back through VTK: proof that they hold what they should."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from evaluation.figures.kind import Columns, Kind
+from evaluation.figures.style import Sheet
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from evaluation.result import Evaluation
+
+
+@dataclass(frozen=True)
+class FromFile:
+    """path of a .pvd or .vtkhdf file with the arrays displacement and predicted, and the model that predicted."""
+
+    path: Path
+    model: str
+
+    def numbers(self) -> Columns:
+        from crashkit.paraview import read_state
+
+        time, mesh = read_state(self.path)
+        arrays = {name: np.asarray(mesh.point_data[name]) for name in mesh.point_data}
+        return {
+            "array": list(arrays),
+            "components": [1 if a.ndim == 1 else a.shape[1] for a in arrays.values()],
+            "smallest": [float(np.nanmin(a)) for a in arrays.values()],
+            "largest": [float(np.nanmax(a)) for a in arrays.values()],
+            "time_s": [time] * len(arrays),
+        }
+
+    def draw(self, sheet: Sheet) -> Figure:
+        from evaluation.pictures import file_picture
+
+        return file_picture(self.path, name=self.model, sheet=sheet)
+
+    def caption(self) -> str:
+        arrays = self.numbers()["array"]
+        return (
+            f"The last state of {self.path.name}, read back from the file: truth, prediction of {self.model} and "
+            f"error. In "
+            f"ParaView, open the .pvd or the .vtkhdf file and warp by `displacement` or `predicted`; the arrays are "
+            f"{', '.join(arrays)}, in metres."
+        )
+
+
+def select(evaluation: Evaluation) -> FromFile | None:
+    from evaluation.files import file_name
+    from evaluation.rendering import rendering_problem
+
+    best = evaluation.ranked[0]
+    ending = file_name(evaluation.model(best).name)
+    found = [p for p in evaluation.files if p.suffix == ".vtkhdf" and p.stem.endswith(f"_{ending}")]
+    if not found or rendering_problem() is not None:
+        return None
+    finest = evaluation.model(best).predictors[0].name
+    return FromFile(found[0], finest)
+
+
+FIGURE = Kind("paraview", "The files for ParaView", select, raster=True)
