@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -178,10 +179,11 @@ def draw_levels(
     import numpy as np
     from matplotlib.figure import Figure
 
-    from crashkit.errors import OutputError
     from crashkit.mesh.probe import without_sides
     from evaluation.rendering import choose_view, render
 
+    with _output(picture):
+        picture.parent.mkdir(parents=True, exist_ok=True)
     view = choose_view([position], face_nodes)
     columns = len(hierarchy.levels) + 1
     width = 620
@@ -206,9 +208,16 @@ def draw_levels(
         )
     for ax in axes.ravel():
         ax.set_axis_off()
-    try:
-        picture.parent.mkdir(parents=True, exist_ok=True)
+    with _output(picture):
         figure.savefig(picture, format="png")
+
+
+@contextmanager
+def _output(picture: Path) -> Iterator[None]:
+    from crashkit.errors import OutputError
+
+    try:
+        yield
     except OSError as error:
         raise OutputError(
             f"{picture}: cannot be written ({error.strerror or error}); the hierarchy is stored, choose another place"
