@@ -204,7 +204,8 @@ _FAST: dict[str, Any] = {
     },
     "transfer": {"mlp": "residual"},
 }
-_PRESETS: Mapping[str, dict[str, Any]] = {"fast": _FAST, "paper": {}}
+_PAPER: dict[str, Any] = {"validation": {"measure": "paper"}}
+_PRESETS: Mapping[str, dict[str, Any]] = {"fast": _FAST, "paper": _PAPER}
 _OF_MODEL: Mapping[str, dict[str, Any]] = {
     "podnn": {"level": {"reduction": "pod", "start": "plain", "latent": 4}, "levels": [0]},
     "aenn": {"level": {"reduction": "ae", "start": "plain"}, "levels": [0]},

@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from surrogates.cascade import Cascade
 from surrogates.errors import SurrogateError
 from surrogates.model import Surrogate
+from surrogates.network import Network
 from surrogates.operators import exportable
 from surrogates.upsampling import Upsampling
 
@@ -30,14 +30,14 @@ TOLERANCE = 1e-5
 class LevelProgram(nn.Module):
     """(parameters, time) -> displacements of one level, lifted to the full mesh by its static U if asked."""
 
-    def __init__(self, cascade: Cascade, number: int, lift: Upsampling | None) -> None:
+    def __init__(self, network: Network, number: int, lift: Upsampling | None) -> None:
         super().__init__()
-        self.cascade = cascade
+        self.network = network
         self.number = number
         self.lift = lift
 
     def forward(self, parameters: Tensor, time: Tensor) -> Tensor:
-        states = self.cascade(parameters, time, self.number)
+        states = self.network(parameters, time, self.number)
         return (states if self.lift is None else self.lift(states)).transpose(0, 1)
 
 
@@ -52,7 +52,7 @@ def export(surrogate: Surrogate, path: str | Path, level: int | None = None, *, 
     path = Path(path)
     if path.suffix not in SUFFIXES:
         raise SurrogateError(f"{path}: the suffix says what is written; expected {' or '.join(SUFFIXES)}")
-    if not isinstance(surrogate.core, Cascade):
+    if not isinstance(surrogate.core, Network):
         raise SurrogateError(
             f"{surrogate.settings.model} is no network; export takes mh, podnn, aenn and gaenn. Its folder holds plain arrays"
         )

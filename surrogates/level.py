@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from surrogates.errors import SurrogateError
+from surrogates.network import take_over
 from surrogates.networks import Regressor
 from surrogates.reduction import LinearReduction, Reduction
 from surrogates.upsampling import Upsampling
@@ -136,20 +137,8 @@ class Level(nn.Module):
         return {k: v for k, v in self.state_dict().items() if not k.startswith("coarse.")}
 
     def load_own_state(self, tensors: dict[str, Tensor]) -> None:
-        """Take over what `own_state` gave; raises SurrogateError naming a tensor that is missing or has another shape."""
-        mine = self.own_state()
-        for name in sorted(mine.keys() | tensors.keys()):
-            if name not in tensors:
-                raise SurrogateError(f"tensor {name} is missing from the stored weights")
-            if name not in mine:
-                raise SurrogateError(f"tensor {name} is in the stored weights, but the model has none of that name")
-            if mine[name].shape != tensors[name].shape:
-                raise SurrogateError(
-                    f"tensor {name} is stored as {tuple(tensors[name].shape)}; the model needs {tuple(mine[name].shape)}"
-                )
-        with torch.no_grad():
-            for name, tensor in mine.items():
-                tensor.copy_(tensors[name])
+        """Take over what `own_state` gave; raises SurrogateError naming what does not fit."""
+        take_over(self.own_state(), tensors)
 
     def parameter_counts(self) -> dict[str, int]:
         """Numbers that make up this level without the coarser ones: "reduction", "regression", "upsampling".

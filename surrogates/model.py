@@ -12,16 +12,18 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from surrogates.cascade import CHUNK, Cascade
 from surrogates.config import Settings
 from surrogates.data import Campaign
 from surrogates.errors import SurrogateError
 from surrogates.graphs import Graphs
 from surrogates.inputs import Ranges
+from surrogates.network import Network
 from surrogates.pod_regression import PodRegression
 from surrogates.samples import Split
 from surrogates.training import Fit
 
+# Samples predicted at once.
+_CHUNK = 512
 _NAMES = {"podnn": "PODNN", "aenn": "AENN", "gaenn": "GAENN", "pod-gpr": "POD-GPR", "pod-rbf": "POD-RBF"}
 
 
@@ -87,7 +89,7 @@ class Surrogate:
         settings: Settings,
         record: Record,
         graphs: Graphs,
-        core: Cascade | PodRegression,
+        core: Network | PodRegression,
         points: NDArray[np.float64] | None = None,
         faces: NDArray[np.int32] | None = None,
     ) -> None:
@@ -144,7 +146,7 @@ class Surrogate:
             return self.core.reconstruct(x, number)
         core = self.core
         with torch.no_grad():
-            parts = [core.reconstruct(part.transpose(0, 1), number) for part in torch.from_numpy(x).split(CHUNK)]
+            parts = [core.reconstruct(part.transpose(0, 1), number) for part in torch.from_numpy(x).split(_CHUNK)]
         return torch.cat([part.transpose(0, 1) for part in parts]).contiguous().numpy()
 
     def outside(self, parameters: ArrayLike, time: ArrayLike | None = None) -> list[str]:
@@ -183,7 +185,7 @@ class Surrogate:
         with torch.no_grad():
             parts = [
                 core(a, t, number).transpose(0, 1)  # type: ignore[operator]
-                for a, t in zip(at.split(CHUNK), when.split(CHUNK), strict=True)
+                for a, t in zip(at.split(_CHUNK), when.split(_CHUNK), strict=True)
             ]
         out = (parts[0] if len(parts) == 1 else torch.cat(parts)).contiguous().numpy()
         return out.reshape(len(parameters), len(time), *out.shape[1:])

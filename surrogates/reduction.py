@@ -29,6 +29,10 @@ class Reduction(nn.Module):
         """(batch, latent) -> (node, batch, 3)"""
         raise SurrogateError(f"{type(self).__name__} cannot decode")
 
+    def decode_only(self) -> None:
+        """Give up the encoder, where another level encodes."""
+        raise SurrogateError(f"{type(self).__name__} cannot do without its encoder")
+
 
 @dataclass(frozen=True)
 class LinearStart:
@@ -52,16 +56,21 @@ class GraphReduction(Reduction):
         self.decoder = GraphDecoder(operator, decoded, widths[::-1], order)
 
     def encode(self, x: Tensor) -> Tensor:
-        return self.encoder(x)
+        with _full_precision(x):
+            return self.encoder(x.float())
 
     def decode(self, z: Tensor) -> Tensor:
-        return self.decoder(z)
+        with _full_precision(z):
+            return self.decoder(z.float())
 
     def end_at_zero(self) -> None:
         """Both ends at zero: what stands beside this reduction is all there is, until training moves it."""
         for layer in (self.encoder.dense, _last_layer(self.decoder)):
             for parameter in layer.parameters():
                 nn.init.zeros_(parameter)
+
+    def decode_only(self) -> None:
+        del self.encoder
 
 
 class DenseReduction(Reduction):
@@ -83,6 +92,9 @@ class DenseReduction(Reduction):
         for network in (self.encoder, self.decoder):
             for parameter in network[-1].parameters():
                 nn.init.zeros_(parameter)
+
+    def decode_only(self) -> None:
+        del self.encoder
 
 
 class LinearReduction(Reduction):
@@ -110,6 +122,9 @@ class LinearReduction(Reduction):
     def decode(self, z: Tensor) -> Tensor:
         return unflat(torch.addmm(self.offset, z, self.decode_matrix.t()), self.n_nodes)
 
+    def decode_only(self) -> None:
+        del self.encode_matrix
+
 
 class SumReduction(Reduction):
     """A linear reduction and a nonlinear one, added in both directions."""
@@ -125,6 +140,10 @@ class SumReduction(Reduction):
 
     def decode(self, z: Tensor) -> Tensor:
         return self.linear.decode(z) + self.remainder.decode(z)
+
+    def decode_only(self) -> None:
+        self.linear.decode_only()
+        self.remainder.decode_only()
 
 
 def make_reduction(settings: LevelSettings, edges: object, n_nodes: int, decoded: int | None = None) -> Reduction:
@@ -169,6 +188,11 @@ def flat(x: Tensor) -> Tensor:
 def unflat(rows: Tensor, n_nodes: int) -> Tensor:
     """(batch, 3 * node) -> (node, batch, 3)"""
     return rows.view(rows.shape[0], n_nodes, 3).transpose(0, 1)
+
+
+def _full_precision(x: Tensor) -> torch.autocast:
+    """Convolutions are bound by memory, and their gradient is written by hand: mixed precision leaves them alone."""
+    return torch.autocast(x.device.type, enabled=False)
 
 
 def _last_layer(decoder: GraphDecoder) -> nn.Module:

@@ -96,9 +96,12 @@ def split(campaign: Campaign, settings: Settings, notes: Notes) -> Split:
 
 
 class Runs:
-    """The displacements of one level, run by run: checked, and never all at once unless asked for."""
+    """The displacements of one level, or of some of its `nodes`, run by run: checked, and never all at once unless asked."""
 
-    def __init__(self, campaign: Campaign, level: int, settings: Settings, notes: Notes) -> None:
+    def __init__(
+        self, campaign: Campaign, level: int, settings: Settings, notes: Notes, nodes: NDArray[np.int64] | None = None
+    ) -> None:
+        self._chosen = nodes
         self._field = campaign.displacement(level)
         self._campaign, self._settings, self._notes = campaign, settings, notes
         expected = (len(campaign.parameters), len(campaign.time))
@@ -106,7 +109,8 @@ class Runs:
             raise SurrogateError(
                 f"displacements of level {level} are {tuple(self._field.shape)}; expected {expected[0]} runs and {expected[1]} states"
             )
-        self.states, self.nodes = self._field.shape[1:3]
+        self.states = self._field.shape[1]
+        self.nodes = self._field.shape[2] if nodes is None else len(nodes)
 
     def read(self, run: int) -> NDArray[np.float32]:
         """(state, node, 3), m, without missing values.
@@ -114,6 +118,8 @@ class Runs:
         Raises SurrogateError naming run, state and node of a missing value, unless `settings.missing` holds it.
         """
         values = np.asarray(self._field[int(run)], np.float32)
+        if self._chosen is not None:
+            values = values[:, self._chosen]
         bad = np.asarray(~np.isfinite(values).all(axis=2))
         if not values.any():
             self._notes.add(f"run {self._name(run)} does not move in any state; it is learnt as it is")

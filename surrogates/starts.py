@@ -7,7 +7,7 @@ remainder on the coarse latent vector; with `concat`, modes of the detail x - U 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 import torch
@@ -16,6 +16,10 @@ from torch import Tensor
 from surrogates.level import Level
 from surrogates.pod import pod
 from surrogates.reduction import LinearReduction, LinearStart, flat
+from surrogates.unified import Unified
+
+# Gives the training states, some (node, b, 3) at a time, as often as it is called.
+Batches = Callable[[], Iterator[Tensor]]
 
 # Relative to the mean square of a latent number; keeps the regression well posed where two of them agree.
 _RIDGE = 1e-5
@@ -45,34 +49,56 @@ def pod_start(batches: Iterator[Tensor], count: int, n_nodes: int) -> LinearStar
 
 
 @torch.no_grad()
-def start_linear_part(level: Level, linear: LinearReduction, batches: Callable[[], Iterator[Tensor]]) -> None:
-    """Compute the linear part `linear` of an untrained `level` from the training states.
-
-    batches  gives the states, some (node, b, 3) at a time, as often as it is called
-    """
+def start_level(level: Level, linear: LinearReduction, batches: Batches) -> None:
+    """Compute the linear part `linear` of an untrained `level`."""
     own = linear.encode_matrix.shape[1]
     if level.coarse is None:
         linear.start_at(pod_start(batches(), own, level.n_nodes))
         return
     if level.concat:
         detail = pod_start((x - _interpolated(level, x) for x in batches()), own, level.n_nodes)
-        encode = detail.encode - _back(level, detail.encode)
-        linear.encode_matrix.copy_(encode)
+        linear.encode_matrix.copy_(detail.encode - _back(level, detail.encode))
     linear.decode_matrix.zero_()
     linear.offset.zero_()
-    product: Tensor | float = 0.0
-    moments: Tensor | float = 0.0
-    count = 0
-    for x in batches():
-        z = level.encode(x)
-        left = flat(x - level.lifted(z)).double()
-        with_one = torch.cat([z, torch.ones_like(z[:, :1])], dim=1).double()
-        moments = moments + with_one.T @ with_one
-        product = product + with_one.T @ left
-        count += len(z)
-    if not isinstance(moments, Tensor) or not isinstance(product, Tensor):
+
+    def remainders() -> Iterator[tuple[Tensor, Tensor]]:
+        for x in batches():
+            z = level.encode(x)
+            yield z, x - level.lifted(z)
+
+    _regress(linear, remainders())
+
+
+@torch.no_grad()
+def start_unified(network: Unified, batches: Batches) -> None:
+    """Compute the linear parts of all levels: POD encodes on the finest, each decoder takes what is left to it."""
+    parts = network.linear_parts()
+    finest = network.numbers[-1]
+    if finest not in parts:
         return
-    ridge = _RIDGE * torch.diag(moments.diagonal().clamp_min(1e-12))
+    parts[finest].encode_matrix.copy_(pod_start(batches(), network.latent(finest), network.n_nodes).encode)
+    for number, part in parts.items():
+        part.decode_matrix.zero_()
+        part.offset.zero_()
+
+        def remainders(number: int = number) -> Iterator[tuple[Tensor, Tensor]]:
+            for x in batches():
+                z = network.encode(x)
+                yield z, network.restrict(x, number) - network.decode_all(z, number)[number]
+
+        _regress(part, remainders())
+
+
+def _regress(linear: LinearReduction, pairs: Iterable[tuple[Tensor, Tensor]]) -> None:
+    """Set the decoder to the least-squares map from z (b, latent) to states (node, b, 3)."""
+    size = linear.decode_matrix.shape[1] + 1
+    moments = torch.zeros(size, size, dtype=torch.float64)
+    product = torch.zeros(size, len(linear.offset), dtype=torch.float64)
+    for z, left in pairs:
+        with_one = torch.cat([z, torch.ones_like(z[:, :1])], dim=1).double()
+        moments += with_one.T @ with_one
+        product += with_one.T @ flat(left).double()
+    ridge = torch.diag(_RIDGE * moments.diagonal().clamp_min(1e-12))
     solved = torch.linalg.solve(moments + ridge, product).float()
     linear.decode_matrix.copy_(solved[:-1].T)
     linear.offset.copy_(solved[-1])
@@ -84,7 +110,7 @@ def _interpolated(level: Level, x: Tensor) -> Tensor:
 
 
 def _back(level: Level, matrix: Tensor) -> Tensor:
-    """(U D)^T times the columns of `matrix` (3 * node, r): with it, encode^T (x - U D x) = (encode - back)^T x."""
+    """(U D)^T times the columns of `matrix` (3 * node, r): encode^T (x - U D x) = (encode - back)^T x."""
     up = level.upsampling.as_matrix()  # type: ignore[union-attr]
     fields = matrix.reshape(level.n_nodes, -1)
     out = torch.zeros_like(fields)

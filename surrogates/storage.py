@@ -37,7 +37,9 @@ from surrogates.errors import ModelFolderError, SurrogateError
 from surrogates.graphs import Graphs
 from surrogates.inputs import InputScaling
 from surrogates.model import Record, Surrogate, record_as_dict, record_from_dict
+from surrogates.network import Network, take_over
 from surrogates.pod_regression import PodRegression
+from surrogates.unified import Unified
 
 FORMAT = 1
 _MAIN = "model.json"
@@ -142,10 +144,16 @@ def _about(folder: Path) -> dict[str, Any]:
 
 def _core(
     folder: Path, about: Mapping[str, Any], settings: Settings, record: Record, graphs: Graphs
-) -> Cascade | PodRegression:
+) -> Network | PodRegression:
     if settings.model in ("pod-gpr", "pod-rbf"):
         return PodRegression.load(load_file(folder / "pod.safetensors"), settings.model, record.choice["inputs"])
-    cascade = Cascade(InputScaling(record.ranges, products=settings.inputs.products, angles=settings.inputs.angles))
+    scaling = InputScaling(record.ranges, products=settings.inputs.products, angles=settings.inputs.angles)
+    if settings.unified:
+        network = Unified(scaling, settings, graphs, tuple(entry["number"] for entry in about["levels"]))
+        network.scale = float(about["levels"][0]["scale"])
+        take_over(network.state_dict(), load_file(folder / "levels.safetensors"))
+        return network
+    cascade = Cascade(scaling)
     for entry in about["levels"]:
         level = build_level(entry["number"], settings, graphs, cascade)
         level.scale = float(entry["scale"])
@@ -154,8 +162,8 @@ def _core(
     return cascade
 
 
-def _scale(core: Cascade | PodRegression, number: int) -> float:
-    return core.levels[number].scale if isinstance(core, Cascade) else 1.0
+def _scale(core: Network | PodRegression, number: int) -> float:
+    return core.scales[number] if isinstance(core, Network) else 1.0
 
 
 def _graph_tensors(surrogate: Surrogate) -> dict[str, Tensor]:
@@ -164,7 +172,7 @@ def _graph_tensors(surrogate: Surrogate) -> dict[str, Tensor]:
     if surrogate.points is not None and surrogate.faces is not None:
         arrays |= {"points": np.asarray(surrogate.points, np.float64), "faces": np.asarray(surrogate.faces, np.int32)}
     numbers = surrogate.core.numbers
-    if 0 in numbers and isinstance(surrogate.core, Cascade) and graphs.full_edges is not None:
+    if 0 in numbers and isinstance(surrogate.core, Network) and graphs.full_edges is not None:
         arrays["edges"] = graphs.full_edges
     for level in graphs.levels[: max(numbers, default=0)]:
         prefix = f"level_{level.index}."

@@ -60,11 +60,16 @@ class Upsampling(nn.Module):
 
 
 def _padded(csr: sparse.csr_matrix) -> tuple[np.ndarray, np.ndarray]:
-    """Columns (row, k) int64 and weights (row, k), rows with fewer entries filled with weight 0."""
+    """Columns (row, k) int64 and weights (row, k); rows with fewer entries repeat their first column with weight 0.
+
+    So what trains beside an entry of U adds to that entry, and to nothing else.
+    """
     counts = np.diff(csr.indptr)
     width = max(1, int(counts.max(initial=0)))
-    columns = np.zeros((csr.shape[0], width), np.int64)
-    weights = np.zeros((csr.shape[0], width))
     filled = np.arange(width) < counts[:, None]
+    columns = np.zeros((csr.shape[0], width), np.int64)
+    some = counts > 0
+    columns[some] = csr.indices[csr.indptr[:-1][some], None]
+    weights = np.zeros((csr.shape[0], width))
     columns[filled], weights[filled] = csr.indices, csr.data
     return columns, weights

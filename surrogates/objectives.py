@@ -1,0 +1,157 @@
+"""What a batch costs: the two losses of section 3.3 for one level, for fixed modes, and for all levels together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from surrogates.errors import SurrogateError
+from surrogates.level import Known, Level
+from surrogates.reduction import linear_part
+from surrogates.training import Objective
+from surrogates.unified import Unified
+
+# Samples handled at once outside training.
+CHUNK = 512
+
+
+@dataclass
+class Samples:
+    """Samples of one level on a device.
+
+    states     (sample, 3, node), in the level's unit
+    inputs     (sample, inputs)
+    encoded    (sample, coarse latent) and regressed likewise: what the frozen levels say, or None
+    initial    (run, 3, node) first states and `run` (sample,), where the regression reads them
+    """
+
+    states: Tensor
+    inputs: Tensor
+    encoded: Tensor | None = None
+    regressed: Tensor | None = None
+    initial: Tensor | None = None
+    run: Tensor | None = None
+
+    def __len__(self) -> int:
+        return len(self.inputs)
+
+    def batch(self, index: Tensor) -> tuple[Tensor, Tensor, Known, Tensor | None]:
+        """States (node, b, 3), inputs, what is known, and first states (node, b, 3) of samples `index`."""
+        known = Known(
+            None if self.encoded is None else self.encoded[index],
+            None if self.regressed is None else self.regressed[index],
+        )
+        initial = None
+        if self.initial is not None and self.run is not None:
+            which = self.run[index] if len(self.initial) > 1 else torch.zeros(1, dtype=torch.int64)
+            initial = as_states(self.initial[which.to(self.initial.device)])
+        return as_states(self.states[index]), self.inputs[index], known, initial
+
+    def chunks(self) -> Iterator[Tensor]:
+        """Sample numbers, a few hundred at a time."""
+        return iter(torch.arange(len(self), device=self.inputs.device).split(CHUNK))
+
+
+def as_states(rows: Tensor) -> Tensor:
+    """(b, 3, node) -> (node, b, 3), laid out as [channel, node, batch], which convolutions take without a copy."""
+    return rows.permute(1, 2, 0).contiguous().permute(1, 2, 0)
+
+
+class LevelObjective(Objective):
+    """mean((x - dec(mlp))^2) and mean((x - dec(enc(x)))^2) of one level; both decoded in one pass (equation 8)."""
+
+    def __init__(self, level: Level, training: Samples, validation: Samples | None) -> None:
+        super().__init__()
+        self.level = level
+        self.training_samples, self.validation_samples = training, validation
+        self.size = len(training)
+
+    def networks(self) -> dict[str, nn.Module]:
+        return {"level": self.level}
+
+    def forward(self, index: Tensor) -> Tensor:
+        return self._losses(self.training_samples, index)
+
+    def validation(self) -> Tensor | None:
+        return _averaged(self._losses, self.validation_samples)
+
+    def _losses(self, samples: Samples, index: Tensor) -> Tensor:
+        x, inputs, known, initial = samples.batch(index)
+        z = torch.cat([self.level.regress(inputs, known, initial), self.level.encode(x, known)])
+        difference = self.level.decode(z).unflatten(1, (2, len(index))) - x[:, None]
+        return difference.square().mean(dim=(0, 2, 3)).float()
+
+
+class LatentObjective(Objective):
+    """The losses of a level with fixed orthogonal modes, from coefficients alone: |x - D z|^2 = rest + |c - s z|^2.
+
+    samples.states holds the scaled coefficients c / s as (sample, 1, latent); `rest` (sample,) what the modes leave.
+    """
+
+    def __init__(
+        self, level: Level, training: Samples, validation: Samples, rest: Tensor, validation_rest: Tensor
+    ) -> None:
+        super().__init__()
+        self.level = level
+        self.training_samples, self.validation_samples = training, validation
+        self.rest, self.validation_rest = rest, validation_rest
+        self.size = len(training)
+        modes = linear_part(level.reduction)
+        if modes is None:
+            raise SurrogateError("training on coefficients needs a linear reduction")
+        # Modes are orthogonal, so a wrong latent number costs its mode's square and nothing mixes.
+        self.weight = modes.decode_matrix.detach().square().sum(dim=0) / (3 * level.n_nodes)
+
+    def networks(self) -> dict[str, nn.Module]:
+        return {"level": self.level}
+
+    def forward(self, index: Tensor) -> Tensor:
+        return self._losses(self.training_samples, index, self.rest)
+
+    def validation(self) -> Tensor | None:
+        return _averaged(lambda s, k: self._losses(s, k, self.validation_rest), self.validation_samples)
+
+    def _losses(self, samples: Samples, index: Tensor, rest: Tensor) -> Tensor:
+        known = Known()
+        z = self.level.regress(samples.inputs[index], known)
+        wrong = ((samples.states[index, 0] - z).square() @ self.weight).mean()
+        left = rest[index].mean()
+        return torch.stack([left + wrong, left]).float()
+
+
+class UnifiedObjective(Objective):
+    """The two losses, each averaged over the levels."""
+
+    def __init__(self, network: Unified, training: Samples, validation: Samples | None) -> None:
+        super().__init__()
+        self.network = network
+        self.training_samples, self.validation_samples = training, validation
+        self.size = len(training)
+
+    def networks(self) -> dict[str, nn.Module]:
+        return {"levels": self.network}
+
+    def forward(self, index: Tensor) -> Tensor:
+        return self._losses(self.training_samples, index)
+
+    def validation(self) -> Tensor | None:
+        return _averaged(self._losses, self.validation_samples)
+
+    def _losses(self, samples: Samples, index: Tensor) -> Tensor:
+        x, inputs, _, initial = samples.batch(index)
+        z = torch.cat([self.network.regress(inputs, initial), self.network.encode(x)])
+        losses = []
+        for number, states in self.network.decode_all(z).items():
+            difference = states.unflatten(1, (2, len(index))) - self.network.restrict(x, number)[:, None]
+            losses.append(difference.square().mean(dim=(0, 2, 3)))
+        return torch.stack(losses).mean(dim=0).float()
+
+
+def _averaged(losses: Callable[[Samples, Tensor], Tensor], samples: Samples | None) -> Tensor | None:
+    if samples is None or not len(samples):
+        return None
+    total = sum(losses(samples, index) * len(index) for index in samples.chunks())
+    return total / len(samples)  # type: ignore[operator,return-value]
