@@ -1,0 +1,87 @@
+"""Settings: where they come from, who wins, and what is said when they are wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from surrogates.config import Settings, parse, settings
+from surrogates.errors import SurrogateError
+
+
+def test_the_paper_preset_is_the_papers_network() -> None:
+    level = settings("mh", "paper").level
+    assert (level.latent, level.channels, level.order, level.mlp.widths) == (4, (6, 12, 24), 3, (64, 64, 64))
+    assert (level.mlp.activation, level.start, level.schedule, level.batch) == ("elu", "plain", "constant", 32)
+
+
+def test_podnn_has_four_modes_in_both_presets() -> None:
+    for preset in ("fast", "paper"):
+        chosen = settings("podnn", preset)
+        assert (chosen.level.reduction, chosen.level.latent, chosen.levels) == ("pod", 4, (0,))
+
+
+def test_overrides_win_over_the_file_and_the_file_over_the_preset(tmp_path: Path) -> None:
+    file = tmp_path / "settings.yaml"
+    file.write_text("model: aenn\nlevel: {epochs: 7, batch: 5}\n")
+    chosen = settings(file=file, overrides=["level.epochs=9"])
+    assert (chosen.model, chosen.level.epochs, chosen.level.batch) == ("aenn", 9, 5)
+    assert chosen.level.schedule == settings("aenn").level.schedule
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("level.learning_rate=1e-3", 1e-3), ("level.learning_rate=0.01", 0.01), ("level.learning_rate=2", 2)],
+)
+def test_numbers_are_read_as_people_write_them(text: str, value: float) -> None:
+    assert settings("mh", overrides=[text]).level.learning_rate == value
+
+
+def test_single_levels_can_differ() -> None:
+    chosen = settings("mh", overrides=["at.3.epochs=11", "level.epochs=5"])
+    assert (chosen.for_level(3).epochs, chosen.for_level(2).epochs) == (11, 5)
+
+
+def test_settings_survive_json() -> None:
+    chosen = settings("mh", overrides=["at.3.epochs=11", "level.mlp.widths=[8, 8]"])
+    assert parse(chosen.as_dict(), "stored") == chosen
+
+
+def test_settings_cannot_be_changed() -> None:
+    with pytest.raises(ValueError, match="frozen"):
+        settings("mh").seed = 3  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["level.epoch=3"], r"level\.epoch is not a setting; there are .*epochs"),
+        (["nonsense"], "expected path=value"),
+        (["level.epochs=0"], r"level\.epochs = 0"),
+        (["level.reduction=pca"], "'gcn', 'ae' or 'pod'"),
+        (["levels=[1, 2]"], "coarse to fine"),
+        (["at.3.latent=5"], "needs one size"),
+        (["unified=true", "transfer.encoder=concat"], "one latent vector"),
+    ],
+)
+def test_a_wrong_setting_is_named(overrides: list[str], message: str) -> None:
+    with pytest.raises(SurrogateError, match=message):
+        settings("mh", overrides=overrides)
+
+
+def test_an_unknown_model_is_answered_with_the_known_ones() -> None:
+    with pytest.raises(SurrogateError, match="'mhh' is not known; choose mh, podnn, aenn"):
+        settings("mhh")
+
+
+@pytest.mark.parametrize(("content", "message"), [("{level: [", "is no YAML"), ("- 3\n", "holds a list")])
+def test_a_broken_file_is_named(tmp_path: Path, content: str, message: str) -> None:
+    file = tmp_path / "broken.yaml"
+    file.write_text(content)
+    with pytest.raises(SurrogateError, match=rf"broken\.yaml: .*{message}"):
+        settings(file=file)
+
+
+def test_defaults_of_the_class_are_the_papers() -> None:
+    assert Settings().level == settings("mh", "paper").level
