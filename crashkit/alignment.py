@@ -38,8 +38,12 @@ def common_time(times: Sequence[NDArray[np.float64]], wanted: NDArray[np.float64
     coarsest = min(times, key=lambda t: (len(t), -float(t[-1])))
     if end < begin:
         raise DataError(f"the runs have no time in common (one begins at {begin:g} s, one ends at {end:g} s)")
-    half = 0.5 * float(np.median(np.diff(coarsest))) if len(coarsest) > 1 else slack
-    grid = coarsest[(coarsest > begin - max(half, slack)) & (coarsest < end + max(half, slack))].copy()
+    reach = max(slack, 0.499 * float(np.median(np.diff(coarsest))) if len(coarsest) > 1 else 0.0)
+    grid = coarsest[(coarsest >= begin - reach) & (coarsest <= end + reach)].copy()
+    if len(grid) == 0:
+        raise DataError(
+            f"no output time of the coarsest run lies in what all runs cover, {begin:g} to {end:g} s; give --time"
+        )
     if abs(grid[0] - begin) > slack:
         grid[0] = max(grid[0], begin)
     if abs(grid[-1] - end) > slack:

@@ -18,7 +18,7 @@ from crashkit.readers.base import Part
 from crashkit.staging import BackgroundHashes, StagedRun, Staging
 from crashkit.store import ArraySpec, RunSource
 from crashkit.structure import Structure
-from crashkit.survey import Found, Survey
+from crashkit.survey import Found
 from crashkit.transfer import Layout
 from data_schema import CONVENTIONS, dataset_checksum, digests_of_run, parameters, run_checksum, validate
 from data_schema import fields as fields_of
@@ -107,7 +107,6 @@ def publish(
     fresh: Sequence[Found],
     staged: Mapping[str, StagedRun],
     old: Existing | None,
-    look: Survey,
     hashes: BackgroundHashes,
 ) -> tuple[str, ...]:
     """Put the dataset together in the staging folder, then in its place; returns the names of its runs, in order.
@@ -130,8 +129,6 @@ def publish(
     store.remove(staging.whole)
     write(staging.whole, small, specs, runs)
     store.put_in_place(staging.whole, staging.output)
-    if old is not None and old.has_hierarchy:
-        look.note("the mesh hierarchy was that of the former runs and is gone; make a new one with crashkit coarsen")
     return names
 
 

@@ -101,7 +101,7 @@ def dataset_of(
         values = view.displacement(first, last)
         gone = gone_nodes(s, *view.alive(first, last), last - first)
         if gone is not None:
-            values[gone] = np.nan
+            values = np.where(gone[..., None], np.float32(np.nan), values)
         return values
 
     ds = xr.Dataset(

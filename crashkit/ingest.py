@@ -141,8 +141,8 @@ class _Job:
     def run(self, sources: list[Path], execute: _Executor) -> IngestSummary:
         staging = self.staging
         staging.discard_unfinished()
-        old = Existing.open(staging.output)
-        look, old = self._survey(sources, old)
+        former = Existing.open(staging.output)
+        look, old = self._survey(sources, former)
         with closing(BackgroundHashes(staging)) as hashes:
             fresh, unchanged = self._fresh(look, old, hashes)
             if not fresh:
@@ -156,10 +156,12 @@ class _Job:
             staged = self._transfer(fresh, keys, layout, look, execute)
             fresh = [f for f in fresh if f.name in staged]
             if not fresh:
-                raise DataError(f"no run can be used ({_reasons(look)})")
+                raise DataError(f"no run can be used ({look.reasons()})")
             self.tell(len(fresh), len(fresh), "putting the dataset together")
-            names = publish(staging, layout, fresh, staged, old, look, hashes)
-        before = set(old.names) if old else set()
+            names = publish(staging, layout, fresh, staged, old, hashes)
+        if former is not None and former.has_hierarchy:
+            look.note("the mesh hierarchy was that of the former runs and is gone; make a new one with crashkit coarsen")
+        before = set(former.names) if former else set()
         summary = IngestSummary(
             output=staging.output,
             runs=names,
@@ -376,12 +378,8 @@ def _hash(values: NDArray[Any]) -> str:
 
 def _nothing_new(output: Path, old: Existing | None, unchanged: list[str], look: Survey) -> IngestSummary:
     if old is None or not unchanged:
-        raise DataError(f"no run can be used ({_reasons(look)})")
+        raise DataError(f"no run can be used ({look.reasons()})")
     return IngestSummary(
         output, old.names, unchanged=tuple(unchanged), skipped=dict(look.skipped), notes=tuple(look.notes),
         nodes=old.structure.n_nodes, states=len(old.time),
     )  # fmt: skip
-
-
-def _reasons(look: Survey) -> str:
-    return "; ".join(f"{run}: {reason}" for run, reason in look.skipped.items())

@@ -23,10 +23,8 @@ class RunView:
         self.run, self.structure, self.system = run, structure, system
 
     def displacement(self, first: int, last: int) -> NDArray[np.float32]:
-        """(state, node, 3), m, of the states first <= state < last; may be written to."""
-        values = _gather(self.run.displacement(first, last), self.structure.node)
-        values *= np.float32(self.system.length)
-        return values
+        """(state, node, 3), m, of the states first <= state < last; may be the reader's own, so not to be written to."""
+        return _scaled(_gather(self.run.displacement(first, last), self.structure.node), self.system.length)
 
     def alive(self, first: int, last: int) -> tuple[Flags | None, Flags | None]:
         """(state, face) and (state, cell), None where the run does not say; skin lives as long as its solid."""
@@ -51,7 +49,7 @@ class RunView:
         else:
             values = self._on_faces(wanted, first, last)
         with contextlib.suppress(UnknownUnits):  # what is not known is kept as it is, and labelled so
-            values *= np.float32(self.system.factor(info.quantity))
+            values = _scaled(values, self.system.factor(info.quantity))
         return values
 
     def field_rows(self, wanted: Field) -> int:
@@ -92,7 +90,11 @@ def gone_nodes(structure: Structure, faces: Flags | None, cells: Flags | None, s
 
 
 def _gather(values: NDArray[Any], places: NDArray[np.int64]) -> NDArray[np.float32]:
-    """`values[:, places]` as float32 of its own, without the detour where all are taken in order."""
-    if len(places) == values.shape[1] and (places == np.arange(len(places))).all():
-        return np.array(values, np.float32)
-    return values[:, places].astype(np.float32, copy=False)
+    """`values[:, places]` as float32, without copying where all are taken in order."""
+    if len(places) != values.shape[1] or (places != np.arange(len(places))).any():
+        values = values[:, places]
+    return values.astype(np.float32, copy=False)
+
+
+def _scaled(values: NDArray[np.float32], factor: float) -> NDArray[np.float32]:
+    return values if factor == 1 else values * np.float32(factor)

@@ -95,6 +95,7 @@ def create_arrays(store: Path, specs: Sequence[ArraySpec], runs: int) -> dict[st
             fill_value=spec.fill,
             compressors=BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"),
             dimension_names=("sim", *spec.dims),
+            chunk_key_encoding={"name": "default", "separator": "."},  # one folder an array, not one a chunk
         )
         array.attrs.update(dict(spec.attributes))
         out[spec.name] = array
@@ -110,10 +111,10 @@ def write_zarr(target: Path, small: xr.Dataset, specs: Sequence[ArraySpec], runs
 
     create_arrays(target, specs, len(runs))
     for spec in specs:
+        chunks = {store: _chunks_of_runs(store / spec.name) for store in {source.store for source in runs}}
         for place, source in enumerate(runs):
-            chunks = source.store / spec.name / "c" / str(source.place)
-            if chunks.is_dir():
-                shutil.copytree(chunks, target / spec.name / "c" / str(place), copy_function=_link)
+            for chunk in chunks[source.store].get(source.place, ()):
+                _link(chunk, target / spec.name / f"c.{place}.{chunk.name.split('.', 2)[2]}")
     group = zarr.open_group(str(target), mode="r+")
     for name, variable in small.variables.items():
         values = variable.values
@@ -128,6 +129,14 @@ def write_zarr(target: Path, small: xr.Dataset, specs: Sequence[ArraySpec], runs
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that Zarr 3 does not yet specify what xarray looks for first
         zarr.consolidate_metadata(str(target))
+
+
+def _chunks_of_runs(array: Path) -> dict[int, list[Path]]:
+    """Place of a run -> files of its chunks (`c.RUN.TIME.NODE...`)."""
+    out: dict[int, list[Path]] = {}
+    for chunk in sorted(array.glob("c.*")):
+        out.setdefault(int(chunk.name.split(".")[1]), []).append(chunk)
+    return out
 
 
 def same_layout(store: Path, specs: Sequence[ArraySpec]) -> bool:
@@ -155,7 +164,7 @@ def _coordinates_named(small: xr.Dataset, name: str, attributes: Mapping[str, An
     return {**attributes, "coordinates": " ".join(beside)}
 
 
-def _link(source: str, target: str) -> None:
+def _link(source: Path, target: Path) -> None:
     """A hard link, or a copy where the disk has none. Chunks are never written again, so sharing them is safe."""
     try:
         os.link(source, target)

@@ -100,6 +100,12 @@ class Survey:
         if text not in self.notes:
             self.notes.append(text)
 
+    def reasons(self) -> str:
+        """Why runs were skipped, of the first few."""
+        told = [f"{run}: {reason}" for run, reason in list(self.skipped.items())[:3]]
+        more = [f"and {len(self.skipped) - 3} more"] if len(self.skipped) > 3 else []
+        return "; ".join([*told, *more]) or "the sources hold none"
+
     def refuse(self, run: str, error: CrashkitError, stop: bool) -> None:
         """Skip a run and remember why, or give up."""
         if stop:
@@ -146,8 +152,7 @@ def survey(
             out.note(f"{table.path}: {_listed(unused)} in the table, but no such run was given")
     _refuse_short(out, choice, time, stop)
     if not out.found:
-        reasons = "; ".join(f"{run}: {reason}" for run, reason in out.skipped.items())
-        raise DataError(f"no run can be used ({reasons or 'the sources hold none'})")
+        raise DataError(f"no run can be used ({out.reasons()})")
     for name in choice.fields:
         _note_missing(name, out)
     return out

@@ -9,8 +9,11 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +29,15 @@ from crashkit.store import ArraySpec, create_arrays
 from crashkit.structure import Structure, matched
 from crashkit.survey import Choice, Field, Found, reopen
 from data_schema import unit_system
-from data_schema.checksum import ArrayDigest
+from data_schema.checksum import BlockDigest, array_digest, block_digest
 from data_schema.validation import FIRST_STATE_TOLERANCE
 
-# A run's states are turned in memory up to this size, and read from the source in pieces of an eighth of it.
+# A run's states are turned in memory up to this size, and in a file above.
 MEMORY_BYTES = 256 << 20
+# What is read from the source at once: memory of this size is used again and again, where larger is mapped anew.
+_PIECE_BYTES = 16 << 20
+# Blocks of nodes made, hashed, compressed and written at a time; each holds some 10 MB.
+THREADS = 4
 
 Block = NDArray[Any]
 
@@ -93,7 +100,8 @@ def transfer(found: Found, layout: Layout, key: str, place: Path) -> StagedRun:
     try:
         run = reopen(found, layout.choice)
         try:
-            digests, error = _Transfer(run, found, layout, beside).write()
+            with ThreadPoolExecutor(THREADS, thread_name_prefix="write") as pool:
+                digests, error = _Transfer(run, found, layout, beside, pool).write()
         finally:
             run.close()
         shutil.rmtree(place, ignore_errors=True)
@@ -106,8 +114,8 @@ def transfer(found: Found, layout: Layout, key: str, place: Path) -> StagedRun:
 class _Transfer:
     """The work on one run."""
 
-    def __init__(self, run: Run, found: Found, layout: Layout, folder: Path) -> None:
-        self._found, self._layout = found, layout
+    def __init__(self, run: Run, found: Found, layout: Layout, folder: Path, pool: ThreadPoolExecutor) -> None:
+        self._found, self._layout, self._pool = found, layout, pool
         structure = matched(layout.structure, layout.choice.structure(run))
         self._view = RunView(run, structure, unit_system(found.units))
         self._own, self._time = found.time, layout.time
@@ -127,7 +135,7 @@ class _Transfer:
         error = self._displacement(specs["displacement"], gone, digests)
         for name, flags in (("alive", faces), ("cell_alive", cells)):
             if flags is not None:
-                self._put(specs[name], ((part, flags[:, part]) for part in _parts(specs[name])), digests)
+                self._put(specs[name], partial(_columns, flags), digests)
         for name, wanted in self._found.fields.items():
             self._field(specs[name], wanted, digests)
         if "reference_position" in specs:
@@ -144,17 +152,17 @@ class _Transfer:
                 self._check(values, first)
                 turn.put(first, values)
 
-            def blocks() -> Iterator[tuple[slice, Block]]:
-                for part in _parts(spec):
-                    values = turn.nodes(part)
-                    if not self._aligned:
-                        errors.append(interpolation_error(values, self._own, self._time))
-                        values = interpolate(values, self._own, self._time)
-                    if gone is not None:
-                        values[gone[:, part]] = np.nan
-                    yield part, values
+            def block(part: slice) -> Block:
+                values = turn.nodes(part)
+                if not self._aligned:
+                    errors.append(interpolation_error(values, self._own, self._time))
+                    values = interpolate(values, self._own, self._time)
+                if gone is not None:
+                    values = values.copy()
+                    values[gone[:, part]] = np.nan
+                return values
 
-            self._put(spec, blocks(), digests)
+            self._put(spec, block, digests)
         return max(errors)
 
     def _check(self, values: Block, first: int) -> None:
@@ -215,29 +223,42 @@ class _Transfer:
             for first, last in self._pieces(self._view.field_rows(wanted) * width):
                 turn.put(first, self._view.field(wanted, first, last))
 
-            def blocks() -> Iterator[tuple[slice, Block]]:
-                for part in _parts(spec):
-                    values = turn.nodes(part)
-                    if not self._aligned:
-                        values = interpolate(values, self._own, self._time, cubic=False)
-                    yield part, values
+            def block(part: slice) -> Block:
+                values = turn.nodes(part)
+                return values if self._aligned else interpolate(values, self._own, self._time, cubic=False)
 
-            self._put(spec, blocks(), digests)
+            self._put(spec, block, digests)
 
     # Writing
 
     def _pieces(self, state_bytes: int) -> list[tuple[int, int]]:
-        """Ranges of own states whose values stay below an eighth of `MEMORY_BYTES`."""
-        return list(split_states(len(self._own), -(-state_bytes // 12), MEMORY_BYTES // 8))
+        """Ranges of own states whose values stay below `_PIECE_BYTES`."""
+        return list(split_states(len(self._own), -(-state_bytes // 12), _PIECE_BYTES))
 
-    def _put(self, spec: ArraySpec, blocks: Iterator[tuple[slice, Block]], digests: dict[str, str]) -> None:
-        digest = ArrayDigest(np.dtype(spec.dtype))
+    def _put(self, spec: ArraySpec, block: Callable[[slice], Block], digests: dict[str, str]) -> None:
+        """Write an array whose blocks `block` makes; several at a time, since most of the work is outside Python."""
         array = self._arrays[spec.name]
-        for part, values in blocks:
-            digest.update(values)
+
+        def write(part: slice) -> BlockDigest:
+            values = block(part)
             array[0, :, part] = values
-        if digest.says_something:
-            digests[spec.name] = digest.hexdigest()
+            return block_digest(values)
+
+        digest = array_digest(self._pool.map(write, _parts(spec)))
+        if digest is not None:
+            digests[spec.name] = digest
+
+
+_kept = threading.local()
+
+
+def _memory(shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Memory for a run, used again for the next one: getting it from the system costs as much as filling it."""
+    size = int(np.prod(shape, dtype=np.int64))
+    if getattr(_kept, "values", np.empty(0)).size < size:
+        _kept.values = np.empty(size, np.float32)
+    values: NDArray[np.float32] = _kept.values[:size].reshape(shape)
+    return values
 
 
 class _Turn:
@@ -247,8 +268,9 @@ class _Turn:
         self._shape = shape
         self._entry = int(np.prod(shape[2:], dtype=np.int64)) * 4
         small = shape[0] * shape[1] * self._entry <= MEMORY_BYTES
-        self._values = np.empty(shape, np.float32) if small else None
+        self._values = _memory(shape) if small else None
         self._scratch = scratch
+        self._lock = threading.Lock()
 
     def __enter__(self) -> _Turn:
         self._file = None if self._values is not None else self._scratch.open("w+b", buffering=0)
@@ -268,15 +290,20 @@ class _Turn:
             self._file.write(np.ascontiguousarray(values, np.float32).data.cast("B"))
 
     def nodes(self, part: slice) -> Block:
-        """(state, nodes of `part`, ...) of all states; may be written to."""
+        """(state, nodes of `part`, ...) of all states, not to be written to; may be called from several threads."""
         if self._values is not None:
-            return np.array(self._values[:, part])
+            return np.ascontiguousarray(self._values[:, part])
         out = np.empty((self._shape[0], part.stop - part.start, *self._shape[2:]), np.float32)
-        for state in range(self._shape[0]):
-            if self._file is not None:
-                self._file.seek((state * self._shape[1] + part.start) * self._entry)
-                self._file.readinto(out[state].data.cast("B"))  # type: ignore[attr-defined]
+        with self._lock:
+            for state in range(self._shape[0]):
+                if self._file is not None:
+                    self._file.seek((state * self._shape[1] + part.start) * self._entry)
+                    self._file.readinto(out[state].data.cast("B"))  # type: ignore[attr-defined]
         return out
+
+
+def _columns(flags: Flags, part: slice) -> Block:
+    return np.ascontiguousarray(flags[:, part])
 
 
 def _parts(spec: ArraySpec) -> list[slice]:

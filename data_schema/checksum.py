@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
@@ -36,28 +37,30 @@ def block_length(states: int, length: int, entry_bytes: int) -> int:
     return max(1, -(-length // count))
 
 
-class ArrayDigest:
-    """SHA-256 of one run's array (time, node, ...), fed with its blocks in order.
+@dataclass(frozen=True)
+class BlockDigest:
+    """SHA-256 of one block (time, nodes of the block, ...), and whether all in it is the default."""
 
-    `says_something` stays False while all values are the default (True for bools, NaN for numbers): such an array
-    is as good as absent and left out of the run's checksum.
+    sha256: bytes
+    is_default: bool
+
+
+def block_digest(block: NDArray) -> BlockDigest:
+    """Digest of a block; the default is True for bools (alive) and NaN for numbers (missing)."""
+    plain = np.ascontiguousarray(block, dtype=block.dtype.newbyteorder("<"))
+    is_default = plain.all() if plain.dtype.kind == "b" else np.isnan(plain.flat[:1]).all() and np.isnan(plain).all()
+    return BlockDigest(hashlib.sha256(plain.data).digest(), bool(is_default))
+
+
+def array_digest(blocks: Iterable[BlockDigest]) -> str | None:
+    """SHA-256 of the digests of one run's array, in order.
+
+    None where all is the default: such an array is as good as absent, and left out of the run's checksum.
     """
-
-    def __init__(self, dtype: np.dtype) -> None:
-        self._hash = hashlib.sha256()
-        self._dtype = np.dtype(dtype).newbyteorder("<")
-        self.says_something = False
-
-    def update(self, block: NDArray) -> None:
-        """Take one block (time, nodes of the block, ...)."""
-        plain = np.ascontiguousarray(block, dtype=self._dtype)
-        if not self.says_something:
-            default = plain.all() if plain.dtype.kind == "b" else np.isnan(plain).all()
-            self.says_something = not default
-        self._hash.update(plain.data)
-
-    def hexdigest(self) -> str:
-        return self._hash.hexdigest()
+    found = list(blocks)
+    if all(block.is_default for block in found):
+        return None
+    return hashlib.sha256(b"".join(block.sha256 for block in found)).hexdigest()
 
 
 def run_checksum(digests: Mapping[str, str]) -> str:
@@ -78,15 +81,12 @@ def result_blocks(variable: xr.DataArray) -> Iterator[tuple[int, int, NDArray]]:
 
 
 def digests_of_run(dataset: xr.Dataset, sim: int) -> dict[str, str]:
-    """Digest of each result array of run number `sim`, read block by block."""
-    out = {}
-    for name in results(dataset):
-        digest = ArrayDigest(dataset[name].dtype)
-        for _, _, block in result_blocks(dataset[name].isel(sim=sim)):
-            digest.update(block)
-        if digest.says_something:
-            out[name] = digest.hexdigest()
-    return out
+    """Digest of each result array of run number `sim` that says something, read block by block."""
+    found = {
+        name: array_digest(block_digest(block) for _, _, block in result_blocks(dataset[name].isel(sim=sim)))
+        for name in results(dataset)
+    }
+    return {name: digest for name, digest in found.items() if digest is not None}
 
 
 def dataset_checksum(
