@@ -13,19 +13,37 @@ from evaluation.measures import masked_mean
 from evaluation.probes import GRADES, cfc_filter, possible_classes, probe_histories, rate
 
 HIGHEST_CLASS = 180  # structural velocities and displacements; crush and occupant channels go higher than states do
+_ENDS = 2
 QUANTITIES = ("displacement", "velocity", "acceleration")
 _TO_SHOWN = {"displacement": (100.0, "cm"), "velocity": (1.0, "m/s"), "acceleration": (1 / 9.80665, "g")}
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Resultants (state, probe) of one run: m, m/s and m/s2. `cfc` is None where the states allow no filter class;
-    velocity and acceleration are then as they come out of the differences, and no acceleration is given."""
+    """Resultants (state, probe) of one run: m, m/s and m/s2, at `time` (state,), s.
 
+    Where the states allow no filter class, `cfc` is None, velocity is as it comes out of the differences, and there is
+    no acceleration. The first and the last two accelerations lean on one-sided differences of one-sided differences:
+    they are left out before the filter can spread them.
+    """
+
+    time: NDArray[np.float64]
     displacement: NDArray[np.float64]
     velocity: NDArray[np.float64]
     acceleration: NDArray[np.float64] | None
     cfc: int | None
+
+    def of(self, quantity: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Times (k,) and values (k, probe) of `quantity`. Raises EvaluationError where there are none."""
+        values = getattr(self, quantity)
+        if values is None:
+            raise EvaluationError(f"no {quantity}: the states are too far apart, or too uneven, for a filter")
+        return (self.time[_ENDS:-_ENDS] if quantity == "acceleration" else self.time), values
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """What there is of displacement, velocity and acceleration."""
+        return QUANTITIES if self.acceleration is not None else QUANTITIES[:2]
 
 
 def curves(time: NDArray[np.float64], displacement: NDArray[np.floating]) -> Curve:
@@ -33,14 +51,17 @@ def curves(time: NDArray[np.float64], displacement: NDArray[np.floating]) -> Cur
     cfc = filter_class(time)
     seen = probe_histories(time, displacement, np.arange(displacement.shape[1]))
 
-    def resultant(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        filtered = values if cfc is None else cfc_filter(time, values, cfc)
+    def resultant(values: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
+        filtered = values if cfc is None else cfc_filter(at, values, cfc)
         return np.linalg.norm(filtered, axis=-1)
 
+    inner = slice(_ENDS, len(time) - _ENDS)
+    enough = cfc is not None and len(time) >= 2 * _ENDS + 4
     return Curve(
+        time,
         np.linalg.norm(seen.displacement, axis=-1),
-        resultant(seen.velocity),
-        None if cfc is None else resultant(seen.acceleration),
+        resultant(seen.velocity, time),
+        resultant(seen.acceleration[inner], time[inner]) if enough else None,
         cfc,
     )
 
@@ -85,16 +106,13 @@ def rate_curves(
     if len(time) < 4:
         return None
     true_curves = [curves(time, u) for u in truths]
-    quantities = tuple(q for q in QUANTITIES if true_curves and getattr(true_curves[0], q) is not None)
+    quantities = true_curves[0].quantities if true_curves else ()
     out = {}
     for model, fields in predictions.items():
         pairs = [(truth, curves(time, u)) for truth, u in zip(true_curves, fields, strict=True)]
         out[model] = np.array(
             [
-                [
-                    [_rating(time, getattr(truth, q)[:, p], getattr(mine, q)[:, p]) for q in quantities]
-                    for p in range(truth.displacement.shape[1])
-                ]
+                [[_rating(truth, mine, q, p) for q in quantities] for p in range(truth.displacement.shape[1])]
                 for truth, mine in pairs
             ]
         )
@@ -103,9 +121,10 @@ def rate_curves(
     return Ratings(quantities, true_curves[0].cfc, out)
 
 
-def _rating(time: NDArray[np.float64], truth: NDArray[np.float64], mine: NDArray[np.float64]) -> float:
+def _rating(truth: Curve, mine: Curve, quantity: str, probe: int) -> float:
+    times, expected = truth.of(quantity)
     try:
-        return rate(time, truth, mine).overall
+        return rate(times, expected[:, probe], mine.of(quantity)[1][:, probe]).overall
     except EvaluationError:  # a curve that never changes, or one too short once its node is gone
         return float("nan")
 

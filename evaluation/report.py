@@ -14,7 +14,7 @@ from evaluation.curves import rating_table
 from evaluation.errors import EvaluationError
 from evaluation.figures import ORDER, drawings, sheet_of
 from evaluation.figures.kind import Columns, to_csv
-from evaluation.figures.style import CM
+from evaluation.figures.style import CM, called
 from evaluation.page import Page, ShownFigure, ShownTable, ShownView, plain_json, render_page, show_figure, show_table
 from evaluation.result import Evaluation
 from evaluation.verdict import RULES, statements
@@ -45,7 +45,8 @@ _TEXT = (
     "the displacement, and averaged over the runs; it does not depend on where the origin lies. "
     "The POD floor is the error of projecting the test runs themselves on the leading modes of all other runs, not "
     "centred: what a linear reduction to as many numbers costs before any regression.",
-    "Milliseconds are medians over repetitions on the machine named below, for all states of a run asked in one call "
+    "Milliseconds are the fastest of nine repetitions on the machine named below, for all states of a run asked "
+    "in one call "
     "and divided by their number, unless a column says otherwise.",
 )
 
@@ -142,11 +143,11 @@ def _views(evaluation: Evaluation) -> tuple[list[ShownView], str]:
     except EvaluationError as error:
         return [], f"the interactive view ({error})"
     caption = (
-        f"Run {reference.runs[run]}, the worst of {best.label}, the most accurate model: truth beside "
+        f"{called(reference.runs[run])}, the worst of {best.label}, the most accurate model: truth beside "
         f"prediction. Turn both "
         f"with the mouse or a finger, and move the slider through time."
     )
-    return [ShownView(f"Run {reference.runs[run]} in three dimensions", caption, html)], ""
+    return [ShownView(f"{called(reference.runs[run])} in three dimensions", caption, html)], ""
 
 
 def _subtitle(evaluation: Evaluation) -> str:

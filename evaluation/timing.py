@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from evaluation.scoring import mesh_of
 
 @dataclass(frozen=True)
 class Timing:
-    """Milliseconds a state, median of several repetitions on this machine.
+    """Milliseconds a state, the fastest of several repetitions on this machine.
 
     own, lifted                on the predictor's own level and on the full mesh, all states of a run in one call
     single, single_lifted      the same for one state alone, as an interactive viewer asks
@@ -27,7 +26,7 @@ class Timing:
     single_lifted: float
 
 
-def time_predictions(reference: Reference, predictor: Predictor, run: int, repeats: int = 7) -> Timing:
+def time_predictions(reference: Reference, predictor: Predictor, run: int, repeats: int = 9) -> Timing:
     """Ask `predictor` for run number `run` again and again; the first call is not counted."""
     parameters, times = reference.parameters[run], reference.time
     mesh = mesh_of(reference, predictor)
@@ -43,7 +42,7 @@ def time_predictions(reference: Reference, predictor: Predictor, run: int, repea
 
     states = len(times)
     own, whole, single, one = (
-        _median_seconds(ask(n, lifted), repeats)
+        _fastest_seconds(ask(n, lifted), repeats)
         for n, lifted in ((states, False), (states, True), (1, False), (1, True))
     )
     if to_full is None:  # nothing to lift: one number, not two samples of the same noise
@@ -51,11 +50,11 @@ def time_predictions(reference: Reference, predictor: Predictor, run: int, repea
     return Timing(own / states * 1e3, whole / states * 1e3, single * 1e3, one * 1e3)
 
 
-def _median_seconds(call: Callable[[], None], repeats: int) -> float:
+def _fastest_seconds(call: Callable[[], None], repeats: int) -> float:
     call()
     seconds = []
     for _ in range(repeats):
         start = time.perf_counter()
         call()
         seconds.append(time.perf_counter() - start)
-    return statistics.median(seconds)
+    return min(seconds)  # what disturbs a measurement only ever makes it slower

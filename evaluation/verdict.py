@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.comparison import Entry
-from evaluation.figures.style import CM
+from evaluation.figures.style import CM, called
 from evaluation.measures import masked_mean
 from evaluation.result import Evaluation
 
 FEW_RUNS = 10  # fewer test runs than this carry no reliable ranking of close models
 NEAR = 1.25  # "nearly as exact": at most a quarter worse than the best
+START_SHARE = 0.1  # of the mean error: more than this in the first state, where nothing has moved, is called out
 POOR_RELATIVE = 0.15  # a relative displacement error above this is called out
 
 RULES = (
@@ -31,7 +32,9 @@ RULES = (
     f"Worst case: lowest error on its worst test run. "
     f"A warning stands wherever there are fewer than {FEW_RUNS} test runs, a relative displacement error above "
     f"{100 * POOR_RELATIVE:.0f} %, a group of nodes whose error exceeds half of its own motion, a finer level that is "
-    f"not better than the coarser one, or a baseline that is better than a multi-hierarchical model."
+    f"not better than the coarser one, a baseline that is better than a multi-hierarchical model, test runs outside "
+    f"the range of the training runs, or a model that moves nodes in the first state by more than "
+    f"{100 * START_SHARE:.0f} % of its mean error."
 )
 
 
@@ -280,6 +283,8 @@ def _warnings(evaluation: Evaluation) -> list[Statement]:
                     f"{best.label} misses more than half of the motion of {_listed(bad[:5])}.",
                 )
             )
+    out += _start(evaluation)
+    out += _outside(evaluation)
     worst = evaluation.scores[best.label].of_runs
     if count > 2 and worst.max() > 2 * np.median(worst):
         run = int(np.argmax(worst))
@@ -287,9 +292,41 @@ def _warnings(evaluation: Evaluation) -> list[Statement]:
             Statement(
                 "warning",
                 "An outlier",
-                f"On run {evaluation.test_names[run]} the error of {best.label} is "
+                f"On {called(evaluation.test_names[run])} the error of {best.label} is "
                 f"{worst.max() / np.median(worst):.1f} times "
                 f"that of a typical run; look at its place in the design space below.",
             )
         )
     return out
+
+
+def _start(evaluation: Evaluation) -> list[Statement]:
+    """Models that predict motion where there is none yet."""
+    if float(np.nanmax([r.size[0] for r in evaluation.runs])) > 0:
+        return []
+    moved = [
+        f"{e.label} {_cm(start)}"
+        for e in evaluation.ranked
+        if (start := float(masked_mean(evaluation.scores[e.label].e2[..., 0]))) > START_SHARE * _error(evaluation, e)
+    ]
+    if not moved:
+        return []
+    text = f"In the first state nothing has moved, yet on average {_listed(moved)} are predicted there."
+    return [Statement("warning", "A motion before the crash", text)]
+
+
+def _outside(evaluation: Evaluation) -> list[Statement]:
+    """Test runs beyond the training runs' ranges, and the error without them."""
+    reference = evaluation.reference
+    if not reference.parameter_names or not evaluation.split.train:
+        return []
+    train, test = (reference.parameters[list(k)] for k in (evaluation.split.train, evaluation.split.test))
+    beyond = ((test < train.min(axis=0)) | (test > train.max(axis=0))).any(axis=1)
+    if not beyond.any():
+        return []
+    best = evaluation.ranked[0]
+    errors = evaluation.scores[best.label].of_runs
+    names = _listed([evaluation.test_names[k] for k in np.flatnonzero(beyond)[:6]])
+    without = f" Without them {best.label} has {_cm(float(errors[~beyond].mean()))}." if (~beyond).any() else ""
+    text = f"{int(beyond.sum())} of {len(test)} test runs lie outside the range of the training runs: {names}.{without}"
+    return [Statement("warning", "Extrapolation", text)]

@@ -102,7 +102,7 @@ def evaluate(
                     step(run)
             result = dataclasses.replace(result, files=tuple(written))
         with _counted(tell, "figures", len(ORDER)) as step:
-            write_report(result, folder, done=lambda name: step(0))
+            write_report(result, folder, names=ORDER, done=lambda name: step(0))
     return result
 
 

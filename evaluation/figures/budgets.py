@@ -69,17 +69,16 @@ class Budgets:
         for m, b in self.budgets.items():
             style = sheet.style(m)
             trade.plot(
-                b.lifted, b.error * CM, marker=style.marker, color=style.colour, markersize=6.5, linestyle="none"
-            )
-            trade.annotate(
-                m, (b.lifted, b.error * CM), xytext=(5, 3), textcoords="offset points", fontsize=7, color=INK
-            )
+                b.lifted, b.error * CM, marker=style.marker, color=style.colour, markersize=6.5, linestyle="none",
+                label=m,
+            )  # fmt: skip
         trade.set_xscale("log")
         trade.margins(x=0.35, y=0.14)
         few_log_ticks(trade.xaxis)
         trade.set_xlabel("ms a state, full mesh")
         trade.set_ylabel("mean node error (cm)")
         trade.set_title("error for its price")
+        sheet.legend(figure, trade)
         return figure
 
     def caption(self) -> str:

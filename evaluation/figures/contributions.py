@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.figures.kind import Columns, Kind
-from evaluation.figures.style import CM, MS, Sheet
+from evaluation.figures.style import CM, MS, Sheet, called
 from evaluation.files import contributions
 
 if TYPE_CHECKING:
@@ -72,7 +72,8 @@ class Contributions:
         rest = sum(sizes[m] for m in names[1:])
         share = 100 * sizes[names[0]] / (sizes[names[0]] + rest) if sizes[names[0]] + rest > 0 else 0.0
         return (
-            f"Run {self.run}: the prediction of the coarsest level, and below it what each finer level adds, "
+            f"{called(self.run)}: at the top the prediction of the coarsest level, below it what each finer "
+            f"level adds, "
             f"drawn on the "
             f"structure as that level predicts it; mind the colour bar of each row. Mean size over nodes and these "
             f"times: {said}; {share:.0f} % of the motion that is added up comes from the coarsest level."

@@ -29,6 +29,7 @@ class ErrorOfGroups:
     names: tuple[str, ...]
     size: NDArray[np.float64]
     errors: Mapping[str, NDArray[np.float64]]
+    about: str = ""
 
     def numbers(self) -> Columns:
         columns: dict[str, list[object]] = {self.what: list(self.names), "mean_displacement_cm": list(self.size * CM)}
@@ -76,7 +77,7 @@ class ErrorOfGroups:
             f"Mean node error within each {self.what}, beside how far the {self.what} moves on average. With {best}, "
             f"{self.names[high]} is the worst with {errors[high] * CM:.2f} cm. A {self.what} whose error is near "
             f"its own motion "
-            f"is not predicted at all, however small its share in the mean over all nodes.{shown}"
+            f"is not predicted at all, however small its share in the mean over all nodes.{shown}{self.about}"
         )
 
 

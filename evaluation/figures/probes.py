@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from evaluation.curves import QUANTITIES, Curve, curves, shown, unit
+from evaluation.curves import Curve, curves, shown, unit
 from evaluation.figures.kind import Columns, Kind
-from evaluation.figures.style import INK, MS, Sheet
+from evaluation.figures.style import INK, MS, Sheet, called
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,42 +25,37 @@ class Probes:
     """One run: truth and predictions as resultant curves (state, probe); nodes (probe,) the solver's numbers."""
 
     run: str
-    time: NDArray[np.float64]
     nodes: tuple[int, ...]
     truth: Curve
     predictions: Mapping[str, Curve]
 
-    def _quantities(self) -> list[str]:
-        return [q for q in QUANTITIES if getattr(self.truth, q) is not None]
-
     def numbers(self) -> Columns:
         rows = []
-        for q in self._quantities():
+        for q in self.truth.quantities:
             for name, curve in {"truth": self.truth, **self.predictions}.items():
-                values = shown(q, getattr(curve, q))
+                times, values = curve.of(q)
+                values = shown(q, values)
                 rows += [
                     (q, unit(q), name, node, t * MS, values[k, p])
                     for p, node in enumerate(self.nodes)
-                    for k, t in enumerate(self.time)
+                    for k, t in enumerate(times)
                 ]
         return dict(
             zip(("quantity", "unit", "curve", "node", "time_ms", "value"), zip(*rows, strict=True), strict=True)
         )
 
     def draw(self, sheet: Sheet) -> Figure:
-        quantities = self._quantities()
+        quantities = self.truth.quantities
         figure, axes = sheet.panels(len(quantities) * len(self.nodes), height=4.0, columns=len(quantities))
         for k, ax in enumerate(axes):
             p, q = divmod(k, len(quantities))
             quantity = quantities[q]
-            ax.plot(
-                self.time * MS, shown(quantity, getattr(self.truth, quantity)[:, p]), color=INK, linewidth=2.2,
-                label="truth",
-            )  # fmt: skip
+            times, values = self.truth.of(quantity)
+            ax.plot(times * MS, shown(quantity, values[:, p]), color=INK, linewidth=2.2, label="truth")
             for model, curve in list(self.predictions.items())[:_SHOWN]:
                 style = sheet.style(model)
                 ax.plot(
-                    self.time * MS, shown(quantity, getattr(curve, quantity)[:, p]), color=style.colour,
+                    times * MS, shown(quantity, curve.of(quantity)[1][:, p]), color=style.colour,
                     linestyle=style.line, linewidth=1.2, label=model,
                 )  # fmt: skip
             ax.set_ylabel(f"{quantity} ({unit(quantity)})")
@@ -83,7 +77,7 @@ class Probes:
         )
         few = f" The {_SHOWN} most accurate models are drawn." if len(self.predictions) > _SHOWN else ""
         return (
-            f"What sensors at {len(self.nodes)} nodes would have measured in run {self.run}, the median run of "
+            f"What sensors at {len(self.nodes)} nodes would have measured in {called(self.run)}, the median run of "
             f"the most "
             f"accurate model: resultant displacement, velocity and acceleration. {filtered} A surrogate that is "
             f"right in its "
@@ -102,7 +96,6 @@ def select(evaluation: Evaluation) -> Probes | None:
         return None
     return Probes(
         evaluation.test_names[run],
-        time,
         tuple(int(n) for n in evaluation.reference.node_id[evaluation.sensors.probes]),
         curves(time, watched.probes),
         {e.label: curves(time, evaluation.scores[e.label].probes[0, run]) for e in evaluation.ranked},

@@ -151,6 +151,11 @@ def readable(values: NDArray[np.float64], unit: str) -> tuple[NDArray[np.float64
     return values, {"m s-1": "m/s", "degree": "°", "1": ""}.get(unit, unit)
 
 
+def called(run: str) -> str:
+    """A run's name within a sentence: `run 7`, but `run_07` as it is."""
+    return run if run.lower().startswith("run") else f"run {run}"
+
+
 def span(label: str, unit: str) -> str:
     """An axis label: what it is, and its unit where it has one."""
     return f"{label.replace('_', ' ')} ({unit})" if unit else label.replace("_", " ")

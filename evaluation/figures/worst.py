@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.figures.kind import Columns, Kind
-from evaluation.figures.style import CM, MS, Sheet
+from evaluation.figures.style import CM, MS, Sheet, called
 from evaluation.measures import masked_mean
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class WorstState:
         error = self._error()
         node = int(np.nanargmax(error))
         return (
-            f"The worst that {self.model}, the most accurate model, does: run {self.run} at {self.time * MS:.1f} "
+            f"The worst that {self.model}, the most accurate model, does: {called(self.run)} at {self.time * MS:.1f} "
             f"ms, with the "
             f"mean node error {float(masked_mean(error)) * CM:.2f} cm. Truth and prediction share one scale, and the "
             f"grey shadow behind the prediction is the truth. The largest error, {error[node] * CM:.2f} cm, "

@@ -1,0 +1,222 @@
+"""`crashkit evaluate` on a small dataset with two stored models: the whole way, and everything that stops it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from crashkit.dataset import demo_data, open_dataset
+
+RUNS, STATES = 8, slice(0, 21, 4)
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory) -> Path:
+    """A folder with a dataset of eight real runs and two trained models that hold the last three runs out."""
+    from crashkit.cli.coarsen import coarsen
+    from crashkit.cli.train import train
+    from crashkit.ingest import ingest
+
+    folder = tmp_path_factory.mktemp("campaign")
+    with h5py.File(demo_data()) as source, h5py.File(folder / "kart.h5", "w") as file:
+        for name in ("kart/displacements", "kart/reference_configuration", "kart/faces", "parameter", "time"):
+            values = source[name][:]
+            if name not in ("kart/faces", "time"):
+                values = values[:RUNS]
+            values = values[:, STATES] if name == "kart/displacements" else values
+            values = values[STATES] if name == "time" else values
+            file.create_dataset(name, data=values)
+            file[name].attrs.update(source[name].attrs)
+        for name in source["kart"].attrs:
+            file["kart"].attrs[name] = source["kart"].attrs[name]
+    ingest([folder / "kart.h5"], folder / "kart.zarr")
+    coarsen(folder / "kart.zarr", [60, 16])
+    few = ("level.epochs=2", "level.channels=[3,6]")
+    for seed in (0, 1):
+        train(folder / "kart.zarr", folder / f"mh{seed}", "mh", overrides=(*few, f"seed={seed}"), test="5:8")
+    train(folder / "kart.zarr", folder / "podnn", "podnn", overrides=("level.epochs=2",), test="5:8")
+    return folder
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """The report with two figures only: what it looks like is tested elsewhere."""
+    monkeypatch.setattr("evaluation.figures.ORDER", ("error_over_time", "floors"))
+    monkeypatch.setattr("evaluation.report._views", lambda evaluation: ([], ""))
+
+
+def run(*arguments: object):
+    from crashkit.cli import app
+
+    return CliRunner().invoke(app, ["evaluate", *map(str, arguments)])
+
+
+def test_the_whole_way(campaign, small, tmp_path):
+    out = tmp_path / "report"
+    result = run(
+        campaign / "kart.zarr", campaign / "mh0", campaign / "podnn", "-o", out, "--write-vtu", "--vtk-runs", "6"
+    )
+    assert result.exit_code == 0, result.output
+    assert "MH1" in result.stdout
+    assert "PODNN" in result.stdout
+    numbers = json.loads((out / "report.json").read_text())
+    assert [r["model"] for r in numbers["performance"]] == ["MH1", "MH2", "PODNN"]
+    names = [str(n) for n in open_dataset(campaign / "kart.zarr")["sim"].values]
+    assert numbers["test_runs"] == names[5:]
+    assert (out / "vtk" / f"{names[6]}_mh0.vtkhdf").exists()
+    assert (out / "vtk" / f"{names[6]}_mh0_level2.pvd").exists()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["report"]
+    assert "kart.zarr" in (out / "report.html").read_text(encoding="utf-8")
+
+
+def test_numbers_are_those_of_asking_the_model(campaign, small, tmp_path):
+    from crashkit.cli.evaluate import evaluate
+    from crashkit.cli.predict import load_model
+
+    result = evaluate(campaign / "kart.zarr", [campaign / "podnn"], tmp_path / "report")
+    model, data = load_model(campaign / "podnn"), open_dataset(campaign / "kart.zarr")
+    errors = []
+    for sim in (5, 6, 7):
+        one = data.isel(sim=sim)
+        parameters = [float(one[name]) for name in model.record.ranges.names]
+        u = model.predict_full(parameters, one["time"].values)
+        errors.append(np.linalg.norm(one["displacement"].values - u, axis=-1).mean())
+    assert result.scores["PODNN"].mean == pytest.approx(np.mean(errors), rel=1e-5)
+
+
+def test_two_workers_find_exactly_the_same(campaign, small, tmp_path):
+    from crashkit.cli.evaluate import evaluate
+
+    both = [evaluate(campaign / "kart.zarr", [campaign / "mh0"], tmp_path / f"by-{n}", workers=n) for n in (1, 2)]
+    for label in ("MH1", "MH2"):
+        np.testing.assert_array_equal(both[0].scores[label].e2, both[1].scores[label].e2)
+        np.testing.assert_array_equal(both[0].scores[label].node_mean, both[1].scores[label].node_mean)
+    np.testing.assert_array_equal(both[0].floor(), both[1].floor())
+
+
+def test_seeds_become_a_spread(campaign, small, tmp_path):
+    result = run(campaign / "kart.zarr", campaign / "mh0", campaign / "mh1", "-o", tmp_path / "report", "--json")
+    assert result.exit_code == 0, result.output
+    rows = json.loads(result.stdout)["performance"]
+    assert [(r["model"], r["seeds"]) for r in rows] == [("MH1", 2), ("MH2", 2)]
+    assert all(r["spread_cm"] > 0 for r in rows)
+
+
+def test_named_test_runs_are_taken(campaign, small, tmp_path):
+    result = run(campaign / "kart.zarr", campaign / "podnn", "-o", tmp_path / "report", "--test", "7:8", "--json")
+    assert result.exit_code == 0, result.output
+    assert "All numbers come from a single test run" in (tmp_path / "report" / "report.html").read_text(
+        encoding="utf-8"
+    )
+
+
+def test_probes_and_intrusion_can_be_chosen(campaign, small, tmp_path):
+    node = int(open_dataset(campaign / "kart.zarr")["node_id"].values[7])
+    out = tmp_path / "report"
+    result = run(campaign / "kart.zarr", campaign / "podnn", "-o", out, "--probes", node, "--json")
+    assert result.exit_code == 0, result.output
+    assert json.loads((out / "report.json").read_text())["tables"]["ratings"]["probe_node"][0] == node
+
+
+def _fails(result, *words: str, code: int = 1) -> None:
+    assert result.exit_code == code, result.output
+    lines = [line for line in result.stderr.splitlines() if line.startswith("error:")]
+    assert len(lines) == 1
+    for word in words:
+        assert word in lines[0]
+
+
+def test_a_test_run_that_was_trained_on_is_refused(campaign, tmp_path):
+    result = run(campaign / "kart.zarr", campaign / "podnn", "-o", tmp_path / "report", "--test", "0:8")
+    _fails(result, "podnn was trained on", "says nothing")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_model_of_another_dataset_is_refused(campaign, tmp_path):
+    from crashkit.ingest import ingest
+
+    with h5py.File(campaign / "kart.h5") as source, h5py.File(tmp_path / "other.h5", "w") as file:
+        for name in ("kart/displacements", "kart/reference_configuration", "kart/faces", "parameter", "time"):
+            file.create_dataset(name, data=source[name][:])
+            file[name].attrs.update(source[name].attrs)
+        file["kart/displacements"][:, 1:] *= 0.5
+    ingest([tmp_path / "other.h5"], tmp_path / "other.zarr")
+    result = run(tmp_path / "other.zarr", campaign / "podnn", "-o", tmp_path / "report")
+    _fails(result, "podnn was trained on another dataset")
+
+
+def test_a_hierarchy_made_anew_is_noticed(campaign, tmp_path):
+    from crashkit.cli.coarsen import coarsen
+
+    shutil.copytree(campaign / "kart.zarr", tmp_path / "kart.zarr")
+    coarsen(tmp_path / "kart.zarr", [61, 17])
+    result = run(tmp_path / "kart.zarr", campaign / "mh0", "-o", tmp_path / "report")
+    _fails(result, "trained on 60 other nodes than level 1 of the dataset has (61)", "train the model again")
+
+
+def test_a_dataset_without_hierarchy_is_an_error_for_a_cascade(campaign, tmp_path):
+    from crashkit.ingest import ingest
+
+    ingest([campaign / "kart.h5"], tmp_path / "kart.zarr")
+    _fails(run(tmp_path / "kart.zarr", campaign / "mh0", "-o", tmp_path / "report"), "hierarchy", "coarsen")
+
+
+def test_a_full_mesh_model_needs_no_hierarchy(campaign, small, tmp_path):
+    from crashkit.ingest import ingest
+
+    ingest([campaign / "kart.h5"], tmp_path / "kart.zarr")
+    result = run(tmp_path / "kart.zarr", campaign / "podnn", "-o", tmp_path / "report", "--json")
+    assert result.exit_code == 0, result.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--vtk-runs", "nobody", "--write-vtu"], ["nobody"]),
+        (["--test", "nobody"], ["nobody"]),
+        (["--probes", "99999999"], ["probe at node 99999999"]),
+        (["--intrusion", "floor:-x"], ["part 'floor' does not exist"]),
+    ],
+)
+def test_what_does_not_exist_is_named(campaign, tmp_path, arguments, words):
+    result = run(campaign / "kart.zarr", campaign / "podnn", "-o", tmp_path / "report", *arguments)
+    _fails(result, *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("arguments", [["--probes", "x"], ["--intrusion", "floor"], ["--workers", "0"]])
+def test_what_cannot_be_understood_is_bad_usage(campaign, tmp_path, arguments):
+    result = run(campaign / "kart.zarr", campaign / "podnn", "-o", tmp_path / "report", *arguments)
+    assert result.exit_code == 2
+
+
+def test_missing_inputs_are_named(campaign, tmp_path):
+    _fails(run(tmp_path / "no.zarr", campaign / "podnn", "-o", tmp_path / "report"), "no.zarr")
+    _fails(run(campaign / "kart.zarr", tmp_path / "no-model", "-o", tmp_path / "report"), "no-model")
+
+
+def test_a_folder_that_is_no_report_is_left_alone(campaign, tmp_path):
+    (tmp_path / "notes.txt").write_text("keep")
+    _fails(run(campaign / "kart.zarr", campaign / "podnn", "-o", tmp_path), "report.json")
+    assert (tmp_path / "notes.txt").read_text() == "keep"
+
+
+def test_an_output_below_a_file_is_an_error(campaign, tmp_path):
+    (tmp_path / "file").write_text("x")
+    _fails(run(campaign / "kart.zarr", campaign / "podnn", "-o", tmp_path / "file" / "report"), "file")
+
+
+def test_an_evaluation_that_breaks_off_leaves_nothing(campaign, tmp_path, monkeypatch):
+    def broken(*arguments, **options):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("evaluation.report.render_page", broken)
+    monkeypatch.setattr("evaluation.figures.ORDER", ("floors",))
+    _fails(run(campaign / "kart.zarr", campaign / "podnn", "-o", tmp_path / "report"), "No space left on device")
+    assert list(tmp_path.iterdir()) == []
