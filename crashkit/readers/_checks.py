@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.errors import CrashkitError, ReadError
+
+# What HDF5, NetCDF, Zarr and XML libraries raise when a file's structure is damaged. A size that cannot be true
+# ends in MemoryError.
+LIBRARY_ERRORS = (
+    ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError, TypeError, ValueError,
+)  # fmt: skip
+
+
+@contextmanager
+def reading(place: object) -> Iterator[None]:
+    """What a library raises over a damaged file becomes a ReadError that names `place`."""
+    try:
+        yield
+    except LIBRARY_ERRORS as error:
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise ReadError(f"{place}: cannot be read ({text}); it is cut short or damaged, copy it again") from error
 
 
 def time_problems(time: NDArray[np.float64], places: Sequence[object]) -> list[str]:

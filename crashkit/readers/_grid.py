@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
 from crashkit.readers._cells import shell_faces
-from crashkit.readers._checks import holds_positions, require_finite, require_indices, time_problems
+from crashkit.readers._checks import holds_positions, reading, require_finite, require_indices, time_problems
 from crashkit.readers._names import DISPLACEMENT_NAMES, WALL_NAME, field_name, quantity
 from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh
 
@@ -89,7 +89,7 @@ class Grid:
 class GridSource(ABC):
     """Where the states of a run come from.
 
-    files, time   as in `Run`
+    files, time, problems   as in `Run`
     first()       the mesh of the first state with all its arrays
     points()      (node, 3) of one state, after a check that the state has the first one's cells
     array()       one array of one state
@@ -98,6 +98,7 @@ class GridSource(ABC):
 
     files: tuple[Path, ...]
     time: NDArray[np.float64]
+    problems: tuple[str, ...] = ()
 
     @abstractmethod
     def first(self) -> Grid: ...
@@ -156,12 +157,8 @@ class WholeStates(GridSource):
         return self._state(state).points
 
     def array(self, kind: Place, name: str, state: int) -> NDArray[Any]:
-        grid, first = self._state(state), self.first()
-        found = (grid.point_data if kind == "point" else grid.cell_data)[name]
-        expected = (first.point_data if kind == "point" else first.cell_data)[name].shape
-        if found.shape != expected:
-            raise ReadError(f"{self.place(state)}: {kind} array {name!r} has shape {found.shape}, expected {expected}")
-        return found
+        grid = self._state(state)
+        return (grid.point_data if kind == "point" else grid.cell_data)[name]
 
     def close(self) -> None:
         self._kept = None
@@ -178,6 +175,8 @@ class GridRun(Run):
         grid = source.first()
         grid.check(source.place(0))
         require_finite(grid.points, "the position", source.place(0))
+        shapes: dict[tuple[Place, str], tuple[int, ...]] = {("point", n): v.shape for n, v in grid.point_data.items()}
+        self._shapes = shapes | {("cell", n): v.shape for n, v in grid.cell_data.items()}
         self._faces, self._cells = _sort_cells(grid, source.place(0))
         self._reading, reference, problems = self._what_moves(grid)
         self.mesh = self._read_mesh(grid, reference)
@@ -186,7 +185,11 @@ class GridRun(Run):
         self._life = _find(grid.cell_data, _ALIVE, everywhere=False)
         unit = grid.units.get(self._reading.array or "", "")
         self.units = "SI" if unit == "m" else None
-        self.problems = (*problems, *time_problems(self.time, [source.place(k) for k in range(len(self.time))]))
+        self.problems = (
+            *source.problems,
+            *problems,
+            *time_problems(self.time, [source.place(k) for k in range(len(self.time))]),
+        )
 
     # What the points and arrays mean
 
@@ -279,18 +282,18 @@ class GridRun(Run):
     # Values of states
 
     def displacement(self, first: int, last: int) -> NDArray[np.float32]:
-        reading, reference = self._reading, self.mesh.position
+        how, reference = self._reading, self.mesh.position
         out = np.empty((last - first, len(reference), 3), np.float32)
         for row, state in enumerate(range(first, last)):
-            points = self._source.points(state)
-            if reading.array is not None:
-                values = self._source.array("point", reading.array, state)
-                if not reading.moving and not np.array_equal(points, reference):
+            points = self._points(state)
+            if how.array is not None:
+                values = self._array("point", how.array, state)
+                if not how.moving and not np.array_equal(points, reference):
                     raise ReadError(
                         f"{self._source.place(state)}: its points have moved, but neither in the first nor in the last "
                         "state; expected them to stay or to move in every state"
                     )
-                out[row] = values - reference if reading.positions else values
+                out[row] = values - reference if how.positions else values
             else:
                 out[row] = points - reference
             if self._life is None:  # where elements erode, a node may end in NaN, which ingest checks
@@ -299,7 +302,7 @@ class GridRun(Run):
 
     def field(self, name: str, first: int, last: int) -> NDArray[np.float32]:
         kind, title, told = self._arrays[name]
-        values = np.stack([self._source.array(kind, title, s) for s in range(first, last)]).astype(np.float32)
+        values = np.stack([self._array(kind, title, s) for s in range(first, last)]).astype(np.float32)
         if kind == "point":
             return values
         values = values[:, (self._faces if self.fields[name].location == "face" else self._cells).rows]
@@ -317,7 +320,21 @@ class GridRun(Run):
         life = self._life
         if life is None:
             return None
-        return np.stack([self._source.array("cell", life, s)[rows] != 0 for s in range(first, last)])
+        return np.stack([self._array("cell", life, s)[rows] != 0 for s in range(first, last)])
+
+    def _points(self, state: int) -> NDArray[np.floating]:
+        with reading(self._source.place(state)):
+            return self._source.points(state)
+
+    def _array(self, kind: Place, name: str, state: int) -> NDArray[Any]:
+        with reading(self._source.place(state)):
+            found = self._source.array(kind, name, state)
+        if found.shape != self._shapes[kind, name]:
+            raise ReadError(
+                f"{self._source.place(state)}: {kind} array {name!r} has shape {found.shape}, "
+                f"expected {self._shapes[kind, name]} as in the first state"
+            )
+        return found
 
     def close(self) -> None:
         self._source.close()

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
 from crashkit.readers import register
-from crashkit.readers._checks import require_options
+from crashkit.readers._checks import LIBRARY_ERRORS, reading, require_options
 from crashkit.readers._folders import runs_in
 from crashkit.readers._grid import Grid, GridRun, GridSource, Place
 from crashkit.readers.base import Run, Runs
@@ -79,12 +79,13 @@ def _is_exodus(file: Path) -> bool:
     try:
         with h5py.File(file, "r") as opened:
             return "eb_prop1" in opened and ("coordx" in opened or "coord" in opened)
-    except (OSError, RuntimeError, KeyError, ValueError):
+    except LIBRARY_ERRORS:
         return False
 
 
 def _open(name: str, file: Path) -> Run:
-    return GridRun(name, _Blocks(file))
+    with reading(file):
+        return GridRun(name, _Blocks(file))
 
 
 class _Blocks(GridSource):
@@ -93,16 +94,12 @@ class _Blocks(GridSource):
     def __init__(self, file: Path) -> None:
         self.file, self.files = file, (file,)
         self._opened = _opened(file)
-        try:
-            self.time = np.asarray(self._take("time_whole", ...), np.float64).reshape(-1)
-            self._points = self._coordinates()
-            self._read_blocks()
-            self._nodal = _grouped(self._texts("name_nod_var"))
-            self._element = _grouped(self._texts("name_elem_var"))
-        except ReadError:
-            raise
-        except (ValueError, TypeError, IndexError, OverflowError, AttributeError) as error:
-            raise ReadError(f"{file}: not readable as Exodus ({error}); it is damaged") from error
+        self.time = np.asarray(self._take("time_whole", ...), np.float64).reshape(-1)
+        self._points = self._coordinates()
+        self._read_blocks()
+        self._nodal = _grouped(self._texts("name_nod_var"))
+        self._element = _grouped(self._texts("name_elem_var"))
+        self.problems = self._unread()
 
     def place(self, state: int) -> str:
         return f"{self.file}, state {state}"
@@ -116,10 +113,16 @@ class _Blocks(GridSource):
     def _take(self, name: str, index: Any) -> NDArray[Any]:
         if name not in self._variables:
             raise ReadError(f"{self.file}: has no variable {name}; it is damaged or holds no states")
-        try:
+        with reading(f"{self.file}, {name}"):
             return np.array(self._variables[name][index])
-        except (OSError, RuntimeError, ValueError, IndexError) as error:
-            raise ReadError(f"{self.file}: {name} cannot be read ({error}); the file is damaged") from error
+
+    def _unread(self) -> tuple[str, ...]:
+        """A problem where a classic file goes on behind its last variable: then it holds more states than it says."""
+        if not hasattr(self._opened, "variables"):  # HDF5 knows where it ends
+            return ()
+        end = max(_end(variable.data) for variable in self._variables.values())
+        behind = self.file.stat().st_size - end
+        return (f"{self.file}: {behind} bytes behind its last variable, at byte {end}; damaged",) if behind > 3 else ()
 
     def _texts(self, name: str) -> list[str]:
         if name not in self._variables:
@@ -213,16 +216,21 @@ def _opened(file: Path) -> Any:
     """The opened file, by SciPy (its variables in `variables`) or h5py (itself a mapping)."""
     with file.open("rb") as stream:
         classic = stream.read(4) in _CLASSIC
-    try:
-        if classic:
-            from scipy.io import netcdf_file
+    if classic:
+        from scipy.io import netcdf_file
 
-            return netcdf_file(str(file), "r", mmap=True)
-        import h5py
+        return netcdf_file(str(file), "r", mmap=True)
+    import h5py
 
-        return h5py.File(file, "r")
-    except Exception as error:  # SciPy raises whatever numpy meets in a damaged header
-        raise ReadError(f"{file}: not readable as NetCDF ({error}); it is cut short or damaged") from error
+    return h5py.File(file, "r")
+
+
+def _end(values: NDArray[Any]) -> int:
+    """Where an array ends in the mapped file that it is a view of."""
+    root = values
+    while isinstance(root.base, np.ndarray):
+        root = root.base
+    return int(np.lib.array_utils.byte_bounds(values)[1] - np.lib.array_utils.byte_bounds(root)[0])
 
 
 def _attribute(variable: Any, name: str) -> str:

@@ -26,7 +26,14 @@ from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
 from crashkit.readers import register
-from crashkit.readers._checks import require_finite, require_indices, require_options, time_problems
+from crashkit.readers._checks import (
+    LIBRARY_ERRORS,
+    reading,
+    require_finite,
+    require_indices,
+    require_options,
+    time_problems,
+)
 from crashkit.readers._names import quantity
 from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh, Runs
 
@@ -58,13 +65,14 @@ class KartHdf5:
                     return False
             with h5py.File(path, "r") as file:
                 return _group(file) is not None
-        except (OSError, RuntimeError, KeyError, ValueError):
+        except LIBRARY_ERRORS:
             return False
 
     def runs(self, path: Path, **options: object) -> Runs:
         require_options(self.name, options, ("mesh",))
         mesh = options.get("mesh")
-        campaign = _Campaign(path, None if mesh is None else Path(str(mesh)))
+        with reading(path):
+            campaign = _Campaign(path, None if mesh is None else Path(str(mesh)))
         return Runs({campaign.name(k): partial(_KartRun, campaign, k) for k in range(campaign.runs)})
 
 
@@ -141,12 +149,8 @@ class _Campaign:
 
     def read(self, dataset: h5py.Dataset, *index: Any) -> NDArray[Any]:
         """`dataset[index]`, with damage on the disk told by name and place."""
-        try:
+        with reading(f"{self.path}, {dataset.name}{list(index)}"):
             return np.asarray(dataset[index])
-        except (OSError, RuntimeError) as error:
-            raise ReadError(
-                f"{self.path}: {dataset.name}{list(index)} cannot be read ({error}); the file is damaged, copy it again"
-            ) from error
 
     def _time(self) -> NDArray[np.float64]:
         time = self._dataset("time", 1, 2)

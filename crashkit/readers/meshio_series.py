@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from crashkit.errors import CrashkitError, ReadError
 from crashkit.readers import register
-from crashkit.readers._checks import require_options
+from crashkit.readers._checks import reading, require_options
 from crashkit.readers._folders import runs_in
 from crashkit.readers._grid import Grid, GridRun, WholeStates
 from crashkit.readers.base import Run, Runs
@@ -93,11 +93,13 @@ def _numbered(path: Path) -> dict[str, list[Path]]:
 
 
 def _open_xdmf(name: str, file: Path) -> Run:
-    return GridRun(name, _Xdmf(file))
+    with reading(file):
+        return GridRun(name, _Xdmf(file))
 
 
 def _open_files(name: str, files: list[Path], step: float) -> Run:
-    return GridRun(name, _Files(files, step))
+    with reading(files[0]):
+        return GridRun(name, _Files(files, step))
 
 
 def _grid(

@@ -16,7 +16,6 @@ made that way the positions are sums of two, which cannot be told from the store
 
 from __future__ import annotations
 
-import json
 import logging
 import re
 from functools import partial
@@ -28,7 +27,7 @@ from numpy.typing import NDArray
 
 from crashkit.errors import CrashkitError, ReadError
 from crashkit.readers import register
-from crashkit.readers._checks import holds_positions, require_options
+from crashkit.readers._checks import holds_positions, reading, require_options
 from crashkit.readers._folders import runs_in
 from crashkit.readers._grid import Grid, GridRun, GridSource, Place
 from crashkit.readers._vtk_process import point_array_names, read_xml
@@ -97,7 +96,8 @@ def _is_zarr(path: Path) -> bool:
 
 
 def _open(name: str, path: Path, mesh: Path | None, step: float | None) -> Run:
-    return GridRun(name, _ZarrStore(path, mesh, step) if path.is_dir() else _VtpStates(path, step), solver="LS-DYNA")
+    with reading(path):
+        return GridRun(name, _ZarrStore(path, mesh, step) if path.is_dir() else _VtpStates(path, step))
 
 
 def _times(count: int, step: float | None, path: Path) -> NDArray[np.float64]:
@@ -118,6 +118,9 @@ class _VtpStates(GridSource):
         if _DISPLACEMENT not in self._arrays:
             raise ReadError(f"{file}: no point arrays {_DISPLACEMENT}_t...; found {', '.join(self._arrays) or 'none'}")
         told = sorted(self._arrays[_DISPLACEMENT], key=float)
+        others = sorted({t for titles in self._arrays.values() for t in titles} - set(told), key=float)
+        if others:
+            self.problems = (f"{file}: has arrays of time {others[0]} but no {_DISPLACEMENT}_t{others[0]}; damaged",)
         self.time = np.array(told, np.float64) if any("." in t for t in told) else _times(len(told), step, file)
         self._states = [{name: titles.get(t) for name, titles in self._arrays.items()} for t in told]
         whole = read_xml(file, [])
@@ -153,12 +156,9 @@ class _ZarrStore(GridSource):
 
         self.path = path
         self.files = tuple(sorted(p for p in path.rglob("*") if p.is_file()))
-        try:
-            self._store: Any = zarr.open_group(str(path), mode="r")
-            position: Any = self._store[_POSITION]
-            shape, kind = position.shape, position.dtype.kind
-        except (OSError, ValueError, KeyError, TypeError, json.JSONDecodeError) as error:
-            raise ReadError(f"{path}: not readable as a Zarr store ({error}); it is damaged") from error
+        self._store: Any = zarr.open_group(str(path), mode="r")
+        position: Any = self._store[_POSITION]
+        shape, kind = position.shape, position.dtype.kind
         if len(shape) != 3 or shape[2] != 3 or 0 in shape or kind != "f":
             raise ReadError(f"{path}: {_POSITION} has shape {shape}, expected (state, node, 3)")
         self._position = position
@@ -194,10 +194,8 @@ class _ZarrStore(GridSource):
         return faces[valid].astype(np.int64), np.concatenate([[0], np.cumsum(valid.sum(axis=1))])
 
     def _read(self, array: Any, index: Any) -> NDArray[Any]:
-        try:
+        with reading(f"{self.path}, {array.name}"):
             return np.asarray(array[index])
-        except Exception as error:  # codecs raise errors of their own
-            raise ReadError(f"{self.path}: {array.name} cannot be read ({error}); the store is damaged") from error
 
     def place(self, state: int) -> str:
         return f"{self.path}, state {state}"

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from crashkit.errors import CrashkitError, ReadError
 from crashkit.readers import register
-from crashkit.readers._checks import require_options
+from crashkit.readers._checks import reading, require_options
 from crashkit.readers._folders import runs_in
 from crashkit.readers._grid import Grid, GridRun, WholeStates
 from crashkit.readers._vtk_legacy import is_legacy, legacy_field_data, read_legacy
@@ -115,6 +115,11 @@ def _kind(file: Path) -> str:
 
 
 def _open(name: str, files: Sequence[Path]) -> Run:
+    with reading(files[0]):
+        return _opened(name, files)
+
+
+def _opened(name: str, files: Sequence[Path]) -> Run:
     kind = _kind(files[0]) if len(files) == 1 else "grid"
     if kind in ("pvd", "series"):
         listed = _collection(files[0]) if kind == "pvd" else _file_series(files[0])

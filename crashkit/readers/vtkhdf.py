@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
 from crashkit.readers import register
-from crashkit.readers._checks import require_options
+from crashkit.readers._checks import LIBRARY_ERRORS, reading, require_options
 from crashkit.readers._folders import runs_in
 from crashkit.readers._grid import Grid, GridRun, GridSource, Place
 from crashkit.readers.base import Run, Runs
@@ -72,7 +72,7 @@ def _is_vtkhdf(file: Path) -> bool:
     try:
         with h5py.File(file, "r") as opened:
             return "VTKHDF" in opened and _kind(opened["VTKHDF"]) in (*_GRIDS, *_COLLECTIONS)
-    except (OSError, RuntimeError, KeyError, ValueError):
+    except LIBRARY_ERRORS:
         return False
 
 
@@ -85,7 +85,8 @@ def _text(value: Any) -> str:
 
 
 def _open(name: str, file: Path) -> Run:
-    return GridRun(name, _Steps(file))
+    with reading(file):
+        return GridRun(name, _Steps(file))
 
 
 class _Part:
@@ -127,10 +128,8 @@ class _Part:
                 f"{self.file}: rows {first} to {last} of {found.name} are asked for, it has {len(found)}; "
                 "the file is damaged"
             )
-        try:
+        with reading(f"{self.file}, {found.name}"):
             return np.asarray(found[first:last])
-        except (OSError, RuntimeError) as error:
-            raise ReadError(f"{self.file}: {found.name} cannot be read ({error}); the file is damaged") from error
 
     def _offset(self, name: str, state: int, column: int = 0) -> int:
         """Where a state begins in an array; 0 where the file does not say."""
@@ -206,10 +205,7 @@ class _Steps(GridSource):
         import h5py
 
         self.file, self.files = file, (file,)
-        try:
-            self._opened = h5py.File(file, "r", rdcc_nbytes=_CHUNK_CACHE)
-        except OSError as error:
-            raise ReadError(f"{file}: not readable as HDF5 ({error}); it is cut short or damaged") from error
+        self._opened = h5py.File(file, "r", rdcc_nbytes=_CHUNK_CACHE)
         root = self._opened.get("VTKHDF")
         kind = _kind(root) if isinstance(root, h5py.Group) else ""
         if kind in _COLLECTIONS:
@@ -220,10 +216,7 @@ class _Steps(GridSource):
             groups = []
         if not groups:
             raise ReadError(f"{file}: holds VTKHDF type {kind or 'nothing'}, expected {' or '.join(_GRIDS)} with Steps")
-        try:
-            self._parts = [_Part(file, group) for group in groups]
-        except (RuntimeError, ValueError, TypeError, IndexError) as error:  # h5py on damaged structures
-            raise ReadError(f"{file}: not readable as VTKHDF ({error}); the file is damaged") from error
+        self._parts = [_Part(file, group) for group in groups]
         self.time = self._parts[0].time
         for part in self._parts:
             if not np.array_equal(part.time, self.time):

@@ -118,6 +118,16 @@ def test_a_file_cut_short_is_refused(written):
             read_everything(written)
 
 
+def test_states_behind_the_announced_ones_are_a_problem(tmp_path, sample, only_run):
+    file = write_exodus(tmp_path / "run.exo", sample, "classic")
+    content = bytearray(file.read_bytes())
+    content[7] = 2  # the number of states of a classic file
+    file.write_bytes(content)
+    run = only_run(file)
+    assert len(run.time) == 2
+    assert "bytes behind its last variable" in run.problems[0]
+
+
 def test_elements_that_are_not_known_are_named(written):
     with netCDF4.Dataset(written, "a") as file:
         file["connect2"].elem_type = "NSIDED"

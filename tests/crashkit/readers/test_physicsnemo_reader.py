@@ -63,6 +63,14 @@ def test_numbered_states_need_a_time_step(tmp_path, only_run, sample):
     assert only_run(file, time_step="0.01").time.tolist() == [0, 0.01, 0.02]
 
 
+def test_a_state_without_displacement_is_a_problem(tmp_path, only_run, sample):
+    file = write_vtp(tmp_path / "run.vtp", sample, sample.displacement)
+    file.write_bytes(file.read_bytes().replace(b"displacement_t0.005", b"displecement_t0.005"))
+    run = only_run(file)
+    assert len(run.time) == 2
+    assert "has arrays of time 0.005 but no displacement_t0.005" in run.problems[0]
+
+
 def test_a_folder_of_vtp_files_is_a_folder_of_runs(tmp_path, sample):
     for number in (1, 2, 10):
         write_vtp(tmp_path / f"Run{number}.vtp", sample, sample.displacement)
