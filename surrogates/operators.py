@@ -114,11 +114,13 @@ class GraphOperator:
                 return moved
             return out.add_(moved) if add else out.copy_(moved)
         out = torch.empty_like(x) if out is None else out
-        # Large graphs go channel by channel, which keeps a channel in cache; small ones in one call, which costs less.
-        together = channels if n <= WIDE_UP_TO else 1
-        matrix = self.tensor(x.device, x.dtype, together)
-        for source, target in zip(x.view(-1, together * n, batch), out.view(-1, together * n, batch)):
-            torch.addmm(target, matrix, source, beta=int(add), out=target)
+        if n <= WIDE_UP_TO:  # one call for all channels costs least
+            matrix = self.tensor(x.device, x.dtype, channels)
+            _sparse_product(matrix, x.view(-1, batch), out.view(-1, batch), add)
+        else:  # one call for each keeps a channel in cache
+            matrix = self.tensor(x.device, x.dtype)
+            for source, target in zip(x, out):
+                _sparse_product(matrix, source, target, add)
         return out
 
     def tensor(self, device: torch.device, dtype: torch.dtype, repeats: int = 1) -> Tensor:
@@ -145,6 +147,14 @@ class GraphOperator:
 
     def __repr__(self) -> str:
         return f"GraphOperator({self.n_nodes} nodes, {self.matrix.nnz} entries, {self.kind}, {self.form})"
+
+
+def _sparse_product(matrix: Tensor, x: Tensor, out: Tensor, add: bool) -> None:
+    """out = matrix x, added to `out` if `add`."""
+    if add:
+        torch.addmm(out, matrix, x, out=out)
+    else:
+        torch.mm(matrix, x, out=out)
 
 
 def normalised_laplacian(adjacency: sparse.spmatrix) -> sparse.csr_matrix:
@@ -204,32 +214,31 @@ class _Propagate(torch.autograd.Function):
 
 
 @cache
-def _powers_of_chebyshev(order: int) -> tuple[tuple[float, ...], ...]:
-    """Row k: the coefficients of T_k in plain powers, from T_k = 2 x T_{k-1} - T_{k-2}."""
+def _powers_of_chebyshev(order: int, device: torch.device, dtype: torch.dtype) -> Tensor:
+    """(order, order), row k: the coefficients of T_k in plain powers, from T_k = 2 x T_{k-1} - T_{k-2}."""
     rows = np.zeros((order, order))
     for k in range(order):
         rows[k, : k + 1] = np.polynomial.chebyshev.cheb2poly(np.eye(k + 1)[k])
-    return tuple(map(tuple, rows))
+    return torch.from_numpy(rows).to(device, dtype)
 
 
 def _of_powers(weight: Tensor) -> Tensor:
-    """The weights V_j (order, in, out) with sum_k T_k(L) x W_k = sum_j L^j x V_j. Its own adjoint is `_of_terms`."""
-    return torch.tensordot(weight.new_tensor(_powers_of_chebyshev(len(weight))).t(), weight, dims=1)
+    """The weights V_j (order, in, out) with sum_k T_k(L) x W_k = sum_j L^j x V_j."""
+    table = _powers_of_chebyshev(len(weight), weight.device, weight.dtype)
+    return torch.mm(table.t(), weight.view(len(weight), -1)).view(weight.shape)
 
 
 def _of_terms(gradient: Tensor) -> Tensor:
-    """The gradient by W_k (order, in, out) from that by V_j."""
-    return torch.tensordot(gradient.new_tensor(_powers_of_chebyshev(len(gradient))), gradient, dims=1)
+    """The gradient by W_k (order, in, out) from that by V_j: the adjoint of `_of_powers`."""
+    table = _powers_of_chebyshev(len(gradient), gradient.device, gradient.dtype)
+    return torch.mm(table, gradient.reshape(len(gradient), -1)).view(gradient.shape)
 
 
-def _powers(operator: GraphOperator, x: Tensor, order: int) -> Tensor:
-    """x, L x, .. L^(order-1) x below each other: (c, n, b) -> (order*c, n, b)."""
-    channels, n, batch = x.shape
-    out = x.new_empty(order, channels, n, batch)
-    out[0] = x
-    for k in range(1, order):
-        operator.times(out[k - 1], out[k])
-    return out.view(order * channels, n, batch)
+def _powers(operator: GraphOperator, powers: Tensor) -> Tensor:
+    """(order, c, n, b) holding x in its first place -> (order*c, n, b) with x, L x, .. L^(order-1) x, in place."""
+    for k in range(1, len(powers)):
+        operator.times(powers[k - 1], powers[k])
+    return powers.flatten(0, 1)
 
 
 def _horner(operator: GraphOperator, coefficients: Tensor) -> Tensor:
@@ -252,7 +261,9 @@ class _Cheb(torch.autograd.Function):
         _, n, batch = x.shape
         of_powers = _of_powers(weight)
         if channels <= width:
-            kept = _powers(operator, x, order)
+            powers = x.new_empty(order, channels, n, batch)
+            powers[0] = x
+            kept = _powers(operator, powers)
             mix = of_powers.reshape(order * channels, width).t()
             flat = kept.view(order * channels, -1)
             out = mix @ flat if bias is None else torch.addmm(bias[:, None], mix, flat)
@@ -261,9 +272,9 @@ class _Cheb(torch.autograd.Function):
             kept = x.contiguous()
             mix = of_powers.transpose(1, 2).reshape(order * width, channels)
             parts = (mix @ kept.view(channels, -1)).view(order, width, n, batch)
-            if bias is not None:
-                parts[0] += bias[:, None, None]
             out = _horner(operator, parts)
+            if bias is not None:
+                out.view(width, -1).add_(bias[:, None])
         if elu:
             functional.elu(out, inplace=True)
         ctx.operator, ctx.elu, ctx.has_bias = operator, elu, bias is not None
@@ -276,18 +287,22 @@ class _Cheb(torch.autograd.Function):
         kept, weight, mix, out = ctx.saved_tensors
         order, channels, width = weight.shape
         _, n, batch = kept.shape
-        gradient = gradients[0].contiguous()
+        # The gradient behind the ELU goes where its powers are wanted, if they are.
+        powers = gradients[0].new_empty(1 if channels <= width else order, width, n, batch)
+        gradient = powers[0]
         if ctx.elu:
-            gradient = torch.ops.aten.elu_backward(gradient, 1.0, 1.0, 1.0, True, out)
-        gradient_bias = gradient.sum(dim=(1, 2)) if ctx.has_bias else None
+            torch.ops.aten.elu_backward.grad_input(gradients[0], 1.0, 1.0, 1.0, True, out, grad_input=gradient)
+        else:
+            gradient.copy_(gradients[0])
+        gradient_bias = gradient.view(width, -1).sum(dim=1) if ctx.has_bias else None
         gradient_x: Tensor | None = None
         if channels <= width:
             flat = gradient.view(width, -1)
-            of_powers = (kept.view(order * channels, -1) @ flat.t()).view(order, channels, width)
+            of_powers = (flat @ kept.view(order * channels, -1).t()).t().reshape(order, channels, width)
             if ctx.needs_input_grad[0]:
                 gradient_x = _horner(ctx.operator, (mix.t() @ flat).view(order, channels, n, batch))
         else:
-            flat = _powers(ctx.operator, gradient, order).view(order * width, -1)
+            flat = _powers(ctx.operator, powers).view(order * width, -1)
             of_powers = (flat @ kept.view(channels, -1).t()).view(order, width, channels).transpose(1, 2)
             if ctx.needs_input_grad[0]:
                 gradient_x = (mix.t() @ flat).view(channels, n, batch)
@@ -307,6 +322,44 @@ def _plain_cheb(x: Tensor, weight: Tensor, bias: Tensor | None, operator: GraphO
 def _mix(x: Tensor, weight: Tensor) -> Tensor:
     """The channels of x (in, n, b) mixed by weight (in, out): -> (out, n, b)."""
     return torch.tensordot(weight.t(), x, dims=1)
+
+
+class _Encode(torch.autograd.Function):
+    """z = h^T W^T + b for h (m, batch), W (latent, m): -> (batch, latent).
+
+    Every product has the latent size in front: with it behind, the same product takes up to ten times as long.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, h: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        ctx.save_for_backward(h, weight)
+        return torch.addmm(bias[:, None], weight, h).t()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        h, weight = ctx.saved_tensors
+        gradient = gradients[0].t()
+        gradient_h = weight.t() @ gradient if ctx.needs_input_grad[0] else None
+        return gradient_h, gradient @ h.t(), gradient.sum(dim=1)
+
+
+class _Decode(torch.autograd.Function):
+    """h = ELU(W z^T + b) for z (batch, latent), W (m, latent): -> (m, batch), and its gradient as in `_Encode`."""
+
+    @staticmethod
+    def forward(ctx: Any, z: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        h = functional.elu(torch.addmm(bias[:, None], weight, z.t()), inplace=True)
+        ctx.save_for_backward(z, weight, h)
+        return h
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        z, weight, h = ctx.saved_tensors
+        gradient = torch.ops.aten.elu_backward(gradients[0], 1.0, 1.0, 1.0, True, h)
+        gradient_z = (weight.t() @ gradient).t() if ctx.needs_input_grad[0] else None
+        return gradient_z, (z.t() @ gradient.t()).t(), gradient.sum(dim=1)
 
 
 class ChebConv(nn.Module):
@@ -471,7 +524,10 @@ class GraphEncoder(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         h = self.convolutions(x).permute(2, 0, 1)
-        return self.dense(h.reshape(-1, h.shape[2]).t())
+        flat = h.reshape(-1, h.shape[2])
+        if self.convolutions.operator.form == "dense":
+            return self.dense(flat.t())
+        return _Encode.apply(flat, self.dense.weight, self.dense.bias)
 
 
 class GraphDecoder(nn.Module):
@@ -489,9 +545,11 @@ class GraphDecoder(nn.Module):
         self.convolutions = Convolutions(operator, channels, order, linear_end=True)
 
     def forward(self, z: Tensor) -> Tensor:
-        h = torch.addmm(self.dense.bias[:, None], self.dense.weight, z.t())
-        h = functional.elu(h, inplace=True).view(-1, self.n_nodes, z.shape[0])
-        return self.convolutions(h.permute(1, 2, 0))
+        if self.convolutions.operator.form == "dense":
+            h = functional.elu(self.dense(z)).t()
+        else:
+            h = _Decode.apply(z, self.dense.weight, self.dense.bias)
+        return self.convolutions(h.reshape(-1, self.n_nodes, z.shape[0]).permute(1, 2, 0))
 
 
 @contextmanager
