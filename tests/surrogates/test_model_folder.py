@@ -1,0 +1,130 @@
+"""The folder a surrogate is stored in: complete or not there, and refused once it was altered."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import plate
+import pytest
+
+from surrogates.config import settings
+from surrogates.errors import ModelFolderError
+from surrogates.model import Surrogate
+from surrogates.storage import load, save
+from surrogates.train import train
+
+
+@pytest.fixture(scope="module")
+def surrogate() -> Surrogate:
+    return train(plate.campaign(8), settings("mh", overrides=["level.epochs=2"]))
+
+
+@pytest.fixture
+def folder(surrogate: Surrogate, tmp_path: Path) -> Path:
+    return save(surrogate, tmp_path / "model")
+
+
+def test_the_folder_says_what_the_surrogate_is_and_has_seen(folder: Path, surrogate: Surrogate) -> None:
+    about = json.loads((folder / "model.json").read_text())
+    record = about["record"]
+    assert about["settings"]["model"] == "mh"
+    assert record["ranges"]["names"] == ["impact_speed", "impact_angle", "yield_stress"]
+    assert record["ranges"]["units"] == ["m s-1", "degree", "Pa"]
+    assert record["checksum"] == "c0ffee"
+    assert record["held_out_runs"] == ["run_900", "run_901"]
+    assert len(record["fitted_runs"]) + len(record["validation_runs"]) == 8
+    assert record["versions"]["torch"]
+    assert set(about["files"]) == {p.name for p in folder.iterdir()} - {"model.json"}
+
+
+@pytest.mark.parametrize("model", ["pod-gpr", "pod-rbf"])
+def test_pod_regressions_come_back_bit_by_bit(model: str, tmp_path: Path) -> None:
+    made = train(plate.campaign(8), settings(model, overrides=["pod.modes=[3]"]))
+    again = load(save(made, tmp_path / "model"))
+    mu = plate.parameters(2, seed=3)
+    np.testing.assert_array_equal(again.predict(mu), made.predict(mu))
+
+
+def test_history_ranges_and_card_come_back(folder: Path, surrogate: Surrogate) -> None:
+    again = load(folder)
+    np.testing.assert_array_equal(again.history(1)["total"], surrogate.history(1)["total"])
+    assert again.training_seconds(1) == surrogate.training_seconds(1)
+    assert again.record.ranges.names == surrogate.record.ranges.names
+    card = (folder / "card.md").read_text()
+    assert "| MH1 | 1 | 25 |" in card
+    assert "2 runs kept away: run_900, run_901" in card
+
+
+def test_nothing_in_the_folder_is_a_pickle(folder: Path) -> None:
+    assert {p.suffix for p in folder.iterdir()} == {".safetensors", ".json", ".md"}
+
+
+def test_the_mesh_comes_along(folder: Path) -> None:
+    again = load(folder)
+    np.testing.assert_array_equal(again.points, plate.grid(9))
+    np.testing.assert_array_equal(again.faces, plate.quads(9))
+    np.testing.assert_array_equal(again.graphs[2].faces, plate.levels()[1].faces)
+
+
+@pytest.mark.parametrize("name", ["level_1.safetensors", "graphs.safetensors", "history.json", "card.md", "model.json"])
+def test_an_altered_file_is_named(folder: Path, name: str) -> None:
+    path = folder / name
+    content = bytearray(path.read_bytes())
+    place = content.rindex(b"0") if name.endswith("json") else len(content) // 2
+    content[place] ^= 1
+    path.write_bytes(bytes(content))
+    with pytest.raises(ModelFolderError, match=name):
+        load(folder)
+
+
+def test_a_missing_file_is_named(folder: Path) -> None:
+    (folder / "level_2.safetensors").unlink()
+    with pytest.raises(ModelFolderError, match=r"level_2\.safetensors: is missing"):
+        load(folder)
+
+
+def test_a_folder_of_another_format_is_refused(folder: Path) -> None:
+    path = folder / "model.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"format": 99}))
+    with pytest.raises(ModelFolderError, match="has format 99, this crashkit reads"):
+        load(folder)
+
+
+@pytest.mark.parametrize(
+    ("made", "message"), [(lambda p: None, "no such model folder"), (lambda p: p.mkdir(), r"holds no model\.json")]
+)
+def test_what_is_no_model_folder_is_refused(tmp_path: Path, made, message: str) -> None:  # type: ignore[no-untyped-def]
+    made(tmp_path / "other")
+    with pytest.raises(ModelFolderError, match=message):
+        load(tmp_path / "other")
+
+
+def test_another_folder_is_never_overwritten(surrogate: Surrogate, tmp_path: Path) -> None:
+    target = tmp_path / "results"
+    target.mkdir()
+    (target / "thesis.tex").write_text("years of work")
+    with pytest.raises(ModelFolderError, match="results: "):
+        save(surrogate, target, overwrite=True)
+    assert (target / "thesis.tex").read_text() == "years of work"
+
+
+def test_an_older_model_is_replaced_only_when_asked(folder: Path, surrogate: Surrogate) -> None:
+    with pytest.raises(ModelFolderError, match="holds a model already"):
+        save(surrogate, folder)
+    save(surrogate, folder, overwrite=True)
+    assert load(folder).level_names == surrogate.level_names
+    assert [p.name for p in folder.parent.iterdir()] == ["model"]
+
+
+def test_a_save_that_fails_leaves_nothing_behind(
+    surrogate: Surrogate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("surrogates.storage.save_file", full)
+    with pytest.raises(ModelFolderError, match="No space left on device"):
+        save(surrogate, tmp_path / "model")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,92 @@
+"""POD with Gaussian processes and radial basis functions, against scikit-learn and scipy."""
+
+from __future__ import annotations
+
+import numpy as np
+import plate
+import pytest
+from scipy.interpolate import RBFInterpolator
+from sklearn.gaussian_process import GaussianProcessRegressor
+
+from surrogates.config import settings
+from surrogates.data import Campaign
+from surrogates.errors import SurrogateError
+from surrogates.pod_regression import Gaussian, PodRegression, RadialBasis, _kernel
+from surrogates.train import train
+
+
+def e2(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.linalg.norm(a - b, axis=-1).mean())
+
+
+def test_one_gaussian_process_for_all_outputs_predicts_as_scikit_learn_does() -> None:
+    draw = np.random.default_rng(0)
+    x, y, query = draw.uniform(-1, 1, (15, 2)), draw.standard_normal((15, 4)), draw.uniform(-1, 1, (6, 2))
+    ours = Gaussian(x).fit(y, seed=0)
+    kernel = _kernel(2).clone_with_theta(ours.theta)
+    theirs = GaussianProcessRegressor(kernel, optimizer=None).fit(x, y)
+    np.testing.assert_allclose(ours.weights(query) @ y, theirs.predict(query), rtol=1e-5, atol=1e-7)
+
+
+def test_radial_basis_functions_are_scipys() -> None:
+    draw = np.random.default_rng(0)
+    x, y, query = draw.uniform(-1, 1, (15, 2)), draw.standard_normal((15, 4)), draw.uniform(-1, 1, (6, 2))
+    theirs = RBFInterpolator(x, y, kernel="thin_plate_spline", degree=1, smoothing=1e-9)(query)
+    np.testing.assert_allclose(RadialBasis(x).weights(query) @ y, theirs, atol=1e-8)
+
+
+@pytest.mark.parametrize("inputs", ["trajectory", "point"])
+@pytest.mark.parametrize("model", ["pod-gpr", "pod-rbf"])
+def test_runs_never_seen_are_predicted(model: str, inputs: str) -> None:
+    surrogate = train(plate.campaign(24), settings(model, overrides=[f"pod.inputs={inputs}", "pod.modes=[8]"]))
+    mu = plate.parameters(3, seed=9)
+    truth = plate.displacement(mu)
+    nothing = e2(truth, np.zeros_like(truth))
+    assert e2(surrogate.predict(mu), truth) < 0.2 * nothing
+
+
+def test_test_runs_do_not_enter_and_validation_chooses() -> None:
+    surrogate = train(plate.campaign(16), settings("pod-rbf", overrides=["pod.modes=[1, 6]"]))
+    record = surrogate.record
+    assert set(record.validation_runs).isdisjoint(record.fitted_runs)
+    assert len(record.validation_runs) == 2
+    assert set(record.held_out_runs).isdisjoint({*record.fitted_runs, *record.validation_runs})
+    best = min(record.errors, key=lambda k: record.errors[k])
+    assert best == f"{record.choice['inputs']}, {record.choice['modes']} modes"
+    assert surrogate.n_latent() == record.choice["modes"]
+
+
+def test_between_trained_times_the_course_is_interpolated_and_held_at_its_ends() -> None:
+    surrogate = train(plate.campaign(12), settings("pod-rbf", overrides=["pod.inputs=trajectory", "pod.modes=[4]"]))
+    mu = plate.parameters(1, seed=5)[0]
+    all_at_once = surrogate.predict(mu)
+    np.testing.assert_allclose(surrogate.predict(mu, plate.TIME[[2]])[0], all_at_once[2], atol=1e-6)
+    between = surrogate.predict(mu, [(plate.TIME[2] + plate.TIME[3]) / 2])[0]
+    np.testing.assert_allclose(between, (all_at_once[2] + all_at_once[3]) / 2, atol=0.02)
+    np.testing.assert_allclose(surrogate.predict(mu, [1.0])[0], all_at_once[-1], atol=1e-6)
+
+
+def test_reconstruction_is_the_projection_on_the_modes() -> None:
+    surrogate = train(plate.campaign(12), settings("pod-gpr", overrides=["pod.modes=[3]", "pod.inputs=trajectory"]))
+    core = surrogate.core
+    assert isinstance(core, PodRegression)
+    states = plate.displacement(plate.parameters(1, seed=5))[0]
+    modes = core.modes.astype(np.float64)
+    expected = (states.reshape(7, -1) @ modes @ modes.T).reshape(7, 81, 3)
+    np.testing.assert_allclose(surrogate.reconstruct(states), expected, atol=1e-5)
+
+
+def test_one_training_run_is_repeated_whatever_is_asked() -> None:
+    surrogate = train(plate.campaign(1), settings("pod-gpr"))
+    asked = surrogate.predict(plate.parameters(1, seed=5)[0])
+    np.testing.assert_allclose(asked, plate.displacement(plate.parameters(1))[0], atol=1e-4)
+    assert any("one training run" in note for note in surrogate.record.notes)
+
+
+def still(runs: int) -> Campaign:
+    return plate.campaign(runs, displacement=lambda level: np.zeros((runs, 7, 81, 3), np.float32))
+
+
+def test_a_campaign_in_which_nothing_moves_is_refused() -> None:
+    with pytest.raises(SurrogateError, match="no training run moves"):
+        train(still(6), settings("pod-gpr"))
