@@ -7,6 +7,7 @@ A format registers itself at the foot of its file. Other packages add theirs wit
 from __future__ import annotations
 
 import importlib
+import logging
 import pkgutil
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -15,6 +16,7 @@ from crashkit.errors import CrashkitError, ReadError
 from crashkit.readers.base import Reader
 
 ENTRY_POINT_GROUP = "crashkit.readers"
+_log = logging.getLogger(__name__)
 _READERS: dict[str, Reader] = {}
 _loaded = False
 
@@ -32,8 +34,11 @@ def readers() -> dict[str, Reader]:
             if module.name != "base" and not module.name.startswith("_"):
                 importlib.import_module(f"{__name__}.{module.name}")
         for entry in entry_points(group=ENTRY_POINT_GROUP):
-            found = entry.load()
-            register(found() if isinstance(found, type) else found)
+            try:
+                found = entry.load()
+                register(found() if isinstance(found, type) else found)
+            except Exception as error:  # whatever it is, our own formats can be read without it
+                _log.warning("reader %s (%s) cannot be loaded: %s", entry.name, entry.value, error)
         _loaded = True
     return dict(_READERS)
 

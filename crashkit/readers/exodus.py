@@ -69,10 +69,11 @@ def _files_in(folder: Path) -> dict[str, Path]:
 
 def _is_exodus(file: Path) -> bool:
     with file.open("rb") as stream:
-        head = stream.read(1 << 16)
-    if head[:4] in _CLASSIC:
-        return b"num_nodes" in head and b"num_el_blk" in head
-    if head[:8] != _HDF5:
+        start = stream.read(8)
+        if start[:4] in _CLASSIC:
+            head = stream.read(1 << 16)
+            return b"num_nodes" in head and b"num_el_blk" in head
+    if start != _HDF5:
         return False
     import h5py
 

@@ -85,8 +85,9 @@ def _is_vtp(path: Path) -> bool:
     if not path.is_file():
         return False
     with path.open("rb") as stream:
-        head = stream.read(_HEAD)
-    return b'type="PolyData"' in head and f'Name="{_DISPLACEMENT}_t'.encode() in head
+        if b'type="PolyData"' not in (head := stream.read(1024)):
+            return False
+        return f'Name="{_DISPLACEMENT}_t'.encode() in head + stream.read(_HEAD)
 
 
 def _is_zarr(path: Path) -> bool:

@@ -50,6 +50,13 @@ def test_a_reader_of_another_package_comes_by_entry_point(fresh_registry, monkey
     assert reader_for(tmp_path / "results.abc").name == "foreign"
 
 
+def test_a_broken_reader_of_another_package_leaves_ours_alone(fresh_registry, monkeypatch, caplog):
+    entry = EntryPoint("broken", "no_such_package:Reader", readers.ENTRY_POINT_GROUP)
+    monkeypatch.setattr(readers, "entry_points", lambda group: [entry])
+    assert set(readers.readers()) >= OURS
+    assert "reader broken (no_such_package:Reader) cannot be loaded" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("folder", "file", "expected"),
     [

@@ -236,7 +236,7 @@ def test_files_made_from_openradioss_keep_what_the_solver_said(converted, only_r
 def test_an_ascii_file_cut_short_anywhere_is_refused(converted, only_run):
     file = converted / "runA002.vtk"
     whole = file.read_bytes()
-    for length in range(len(whole.rstrip()) - 1):
+    for length in range(0, len(whole.rstrip()) - 1, 3):
         file.write_bytes(whole[:length])
         with pytest.raises(ReadError, match=r"runA002\.vtk"):
             only_run(converted).displacement(0, 2)
