@@ -12,6 +12,8 @@ import typer
 from crashkit.cli._console import print_json, progress, say, table
 
 if TYPE_CHECKING:
+    from surrogates.config import Settings
+    from surrogates.data import Campaign
     from surrogates.model import Surrogate
     from surrogates.training import Epoch
 
@@ -64,7 +66,11 @@ def train(
     check_output(output, overwrite)
     campaign = open_campaign(dataset, test)
     state = output.with_name(f".{output.name}.training")
-    with _processes(device) as first, _tensorboard(tensorboard if first else None) as note:
+    with (
+        _processes(device) as first,
+        _enough_threads(largest_product(chosen, campaign)),
+        _tensorboard(tensorboard if first else None) as note,
+    ):
         keeper = Checkpoints(state, chosen, campaign, every=checkpoint_every, resume=resume)
 
         def tell(epoch: Epoch) -> None:
@@ -108,6 +114,35 @@ def check_output(output: Path, overwrite: bool) -> None:
         raise OutputError(f"{output}: cannot be written ({error.strerror}); choose another place with -o") from error
     if not os.access(home, os.W_OK | os.X_OK):
         raise OutputError(f"{output}: cannot be written (no permission in {home}); choose another place with -o")
+
+
+# Below this many numbers in the largest array of a step, handing work to a second thread costs more than it saves: a
+# step of small networks is hundreds of short operations, each of which waits for the slowest thread.
+_WORTH_A_THREAD = 1_000_000
+
+
+def largest_product(chosen: Settings, campaign: Campaign) -> int:
+    """How many numbers the widest convolution or dense layer of one training step makes, over all levels."""
+    out = 0
+    for number in chosen.levels or tuple(level.index for level in campaign.levels):
+        level = chosen.for_level(number)
+        nodes = campaign.n_nodes if number == 0 else campaign.levels[number - 1].n_nodes
+        width = {"gcn": max(3, *level.channels), "ae": 3, "pod": 0}[level.reduction]
+        out = max(out, nodes * width * level.batch)
+    return out
+
+
+@contextlib.contextmanager
+def _enough_threads(numbers: int) -> Iterator[None]:
+    """One thread for small networks; as many as torch would take for large ones."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(before if numbers > _WORTH_A_THREAD else 1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @contextlib.contextmanager
