@@ -139,7 +139,8 @@ class _Part:
         return int(row[min(column, len(row) - 1)])
 
     def _number(self, name: str, state: int) -> int:
-        piece = self._offset("PartOffsets", state)
+        # A number that is stored once holds for all states.
+        piece = self._offset("PartOffsets", state) if len(self._dataset(name)) > 1 else 0
         return int(self._slice(name, piece, piece + 1)[0])
 
     def _cell_place(self, state: int) -> tuple[int, ...]:
@@ -159,8 +160,7 @@ class _Part:
             corners = self._number(f"{at}NumberOfConnectivityIds", state)
             cell_at = self._offset("CellOffsets", state, column)
             corner_at = self._offset("ConnectivityIdOffsets", state, column)
-            # Every piece before has one more offset than cells.
-            offsets = self._slice(f"{at}Offsets", cell_at + piece, cell_at + piece + cells + 1).astype(np.int64)
+            offsets = self._cell_offsets(f"{at}Offsets", cell_at, piece, cells, corners)
             joined.append(self._slice(f"{at}Connectivity", corner_at, corner_at + corners).astype(np.int64))
             ends.append(offsets[1:] + start)
             start += corners
@@ -169,6 +169,22 @@ class _Part:
             else:
                 types.append(self._slice("Types", cell_at, cell_at + cells).astype(np.uint8))
         return np.concatenate(joined), np.concatenate(ends), np.concatenate(types)
+
+    def _cell_offsets(self, name: str, cell_at: int, piece: int, cells: int, corners: int) -> NDArray[np.int64]:
+        """Where the cells of a state begin in their corners, (cells + 1,), from 0 to `corners`.
+
+        Every piece before has one more offset than cells, so a state's begin at `cell_at + piece`; but where the
+        cells are stored once for all states and `piece` counts on, they begin at `cell_at`.
+        """
+        for start in dict.fromkeys((cell_at + piece, cell_at)):
+            if start + cells < len(self._dataset(name)):
+                found = self._slice(name, start, start + cells + 1).astype(np.int64)
+                if found[0] == 0 and found[-1] == corners and (np.diff(found) >= 0).all():
+                    return found
+        raise ReadError(
+            f"{self.file}: {self._group.name}/{name} does not lead from 0 to {corners} in the {cells} cells of piece "
+            f"{piece}; the file is damaged"
+        )
 
     def points(self, state: int) -> NDArray[Any]:
         nodes, place = self._number("NumberOfPoints", state), self._cell_place(state)

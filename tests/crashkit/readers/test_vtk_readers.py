@@ -414,6 +414,20 @@ def test_vtkhdf_equals_what_vtks_writer_wrote(tmp_path, only_run, sample):
     np.testing.assert_array_equal(run.mesh.face_nodes, sample.faces)
 
 
+def test_pieces_that_count_on_over_cells_that_are_stored_once(tmp_path, only_run, sample):
+    """Points of every state, counted as pieces, and one list of cells."""
+    file = tmp_path / "run.vtkhdf"
+    write_paraview(file, sample.points, sample.faces, sample.time, {"displacement": sample.displacement}, deform=True)
+    with h5py.File(file, "a") as opened:
+        root = opened["VTKHDF"]
+        del root["NumberOfPoints"]
+        root["NumberOfPoints"] = [162] * 3
+        root["Steps/PartOffsets"][:] = [0, 1, 2]
+    run = only_run(file)
+    np.testing.assert_allclose(run.displacement(0, 3), sample.displacement, atol=1e-8)
+    np.testing.assert_array_equal(run.mesh.face_nodes, sample.faces)
+
+
 def test_the_parts_of_a_collection_become_parts(tmp_path, only_run, sample):
     halves = np.split(sample.faces, 2)
     names = ("bumper_beam_1", "RWALL_1")
