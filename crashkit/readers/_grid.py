@@ -264,18 +264,16 @@ class GridRun(Run):
         for title, values in grid.cell_data.items():
             if not _is_field(title, values):
                 continue
-            # OpenRadioss's converter fills up with zeros where a field belongs to other elements.
-            kind = re.fullmatch(r"(1D|2D|3D|SPH)ELEM_(.+)", title)
-            plain = field_name(kind[2] if kind else title)
-            theirs = {"1D": _LINE, "SPH": _VERTEX}.get(kind[1]) if kind else None
-            if len(self._faces.rows) and (not kind or kind[1] == "2D"):
+            plain, kind = _element_kind(title)
+            theirs = {"1D": _LINE, "SPH": _VERTEX}.get(kind)
+            if len(self._faces.rows) and kind in ("", "2D"):
                 offer(plain, "face", ("cell", title, None), values)
-            if len(self._cells.rows) and (not kind or kind[1] != "2D"):
+            if len(self._cells.rows) and kind != "2D":
                 told = None
                 if kind:
                     types = self._cells.types
                     told = types == theirs if theirs else (types != _LINE) & (types != _VERTEX)
-                word = {"1D": "beam_", "3D": "solid_", "SPH": "sph_"}[kind[1]] if kind else "cell_"
+                word = {"": "cell_", "1D": "beam_", "3D": "solid_", "SPH": "sph_"}[kind]
                 offer(word + plain, "cell", ("cell", title, told), values)
         return arrays, fields
 
@@ -433,6 +431,17 @@ def _parts(
     if wall.any():
         parts.append(Part(0, "rigid wall", rigid_wall=True))
     return index, tuple(parts)
+
+
+def _element_kind(title: str) -> tuple[str, str]:
+    """Name of a cell array's field, and the elements it is told for: "1D", "2D", "3D", "SPH" or "" for all.
+
+    OpenRadioss's converters write 2DELEM_Plastic_Strain or Plastic Strain_2D, and zeros on all other elements.
+    """
+    front = re.fullmatch(r"(1D|2D|3D|SPH)ELEM_(.+)", title)
+    behind = re.fullmatch(r"(.+)_(1D|2D|3D|SPH)", title)
+    name, kind = (front[2], front[1]) if front else (behind[1], behind[2]) if behind else (title, "")
+    return field_name(name), kind
 
 
 def _is_field(name: str, values: NDArray[Any]) -> bool:

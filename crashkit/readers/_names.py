@@ -35,6 +35,7 @@ _QUANTITIES = {
 _SAME = {
     "eps": "plastic_strain",
     "epsp": "plastic_strain",
+    "eqps": "plastic_strain",
     "effective_plastic_strain": "plastic_strain",
     "equivalent_plastic_strain": "plastic_strain",
     "stress_von_mises": "von_mises",

@@ -449,7 +449,7 @@ def test_the_parts_of_a_collection_become_parts(tmp_path, only_run, sample):
     assert [(p.name, p.rigid_wall) for p in run.mesh.parts] == [("bumper_beam_1", False), ("RWALL_1", True)]
     np.testing.assert_array_equal(run.mesh.face_nodes[60:], halves[1] + 162)
     np.testing.assert_allclose(run.displacement(0, 3)[:, 162:], sample.displacement, atol=1e-8)
-    strain = run.field("plastic_strain_2d", 0, 3)
+    strain = run.field("plastic_strain", 0, 3)
     assert (strain[:, :60] == 0.5).all()
     assert np.isnan(strain[:, 60:]).all()
 
