@@ -1,9 +1,7 @@
 """What stands where in an LS-DYNA d3plot family, and its sections, parsed by lasso-python.
 
-lasso-python loads the whole first file and parses the mesh anew for every slice of states, believes every count in
-the header, and prints failures to stderr and goes on. So the counts are checked against the file's size here before
-lasso-python sees them, it gets the geometry section once and then single blocks of single states, and a failure it
-swallowed becomes a ReadError.
+lasso-python believes every count in the header, so they are checked against the file's size before it sees them. It
+gets the geometry section once, and then single blocks of single states: memory stays at a block.
 
 A file of the family holds whole states, then the word -999999.0, then zeros up to a multiple of 512 words. The
 first file holds the geometry before its states, usually without any.
@@ -11,12 +9,7 @@ first file holds the geometry before its states, usually without any.
 
 from __future__ import annotations
 
-import logging
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
+from crashkit.readers._lasso import geometry_class, guarded
 
 _END = -999999.0
 _HEADER_WORDS = 64
@@ -76,8 +70,8 @@ class D3plotFile:
         need = self._check_header(size)
         with first.open("rb") as stream:
             geometry = stream.read(2 * need + _SLACK)
-        with _lasso_guard(first):
-            self._lasso = _lasso_class()(geometry)
+        with guarded(first):
+            self._lasso = geometry_class()(geometry)
         self.header = self._lasso.header
         self.arrays: dict[str, Any] = dict(self._lasso.arrays)
         self._lasso.arrays = {}
@@ -99,7 +93,7 @@ class D3plotFile:
         """Bytes that the header's counts ask for. Raises ReadError where they cannot be true."""
         from lasso.dyna.d3plot_header import D3plotHeader
 
-        with _lasso_guard(self.first):
+        with guarded(self.first):
             header = D3plotHeader(str(self.first))
         words = header.raw_header
         for name in _COUNTS:
@@ -213,7 +207,7 @@ class D3plotFile:
         """Element results of one state by lasso-python's names, (1, element, ...); `kind` as the block is called."""
         read = {"solid": "solids", "tshell": "tshell", "beam": "beams", "shell": "shell"}[kind]
         found: dict[str, NDArray[Any]] = {}
-        with _lasso_guard(self.states[state].file):
+        with guarded(self.states[state].file):
             getattr(self._lasso, f"_read_states_{read}")(self.block(kind, state)[None], 0, found)
         return found
 
@@ -230,93 +224,3 @@ def _content_end(file: Path, start: int) -> int:
                 return begin + int(filled[-1]) + 1
             end = begin
     return start
-
-
-@cache
-def _lasso_class() -> Any:
-    """lasso-python's D3plot for a geometry section in memory, with its loops bounded."""
-    from lasso.dyna import D3plot
-    from lasso.io.binary_buffer import BinaryBuffer
-
-    class Geometry(D3plot):
-        def __init__(self, content: bytes) -> None:
-            super().__init__()
-            self._buffer = BinaryBuffer()
-            self._buffer.memoryview = memoryview(content)
-            self._read_header()
-            self._parse_geometry()
-            self._buffer = None
-
-        def _bound(self, what: str, place: int, limit: int) -> None:
-            """lasso-python loops over counts from the file; a count that cannot be true is refused."""
-            at = self.geometry_section_size + place * self.header.wordsize
-            count = int(self._buffer.read_number(at, self.header.itype))
-            if not 0 <= count <= limit:
-                raise ValueError(f"{count} {what}, expected at most {limit}")
-
-        def _read_particle_data(self) -> None:
-            if self._buffer and 0 < self.header.raw_header["npefg"] <= 10_000_000:
-                for place in (0, 1, 3):
-                    self._bound("airbag variables", place, 10_000)
-                self._bound("airbag particles", 2, 1 << 28)
-            super()._read_particle_data()
-
-        def _read_rigid_body_description(self) -> None:
-            if self._buffer and self.header.has_rigid_body_data:
-                self._bound("rigid bodies", 0, self.header.n_parts)
-            super()._read_rigid_body_description()
-
-        def _read_rigid_road_surface(self) -> None:
-            if self._buffer and self.header.has_rigid_road_surface:
-                for place, what in enumerate(("road nodes", "road segments", "road surfaces")):
-                    self._bound(what, place, len(self._buffer) // self.header.wordsize)
-            super()._read_rigid_road_surface()
-
-    return Geometry
-
-
-class _Swallowed(logging.Handler):
-    """Keeps what lasso-python logs instead of raising, for the thread that it was logged in."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.WARNING)
-        self.found = threading.local()
-
-    def emit(self, record: logging.LogRecord) -> None:
-        try:
-            text = record.getMessage()
-        except (TypeError, ValueError):  # some of its messages do not fit their arguments
-            text = str(record.msg)
-        self.found.__dict__.setdefault("messages", []).append(text)
-
-
-@cache
-def _swallowed() -> _Swallowed:
-    # lasso-python configures the root logger when imported; that is for the application to do.
-    root = logging.getLogger()
-    before = list(root.handlers)
-    from lasso.dyna import d3plot, d3plot_header
-
-    for handler in [h for h in root.handlers if h not in before]:
-        root.removeHandler(handler)
-    keeper = _Swallowed()
-    for logger in (d3plot.LOGGER, d3plot_header.LOGGER):
-        logger.addHandler(keeper)
-        logger.propagate = False
-    return keeper
-
-
-@contextmanager
-def _lasso_guard(file: Path) -> Iterator[None]:
-    """What lasso-python raises or logs becomes a ReadError."""
-    keeper = _swallowed()
-    keeper.found.messages = []
-    try:
-        yield
-    except ReadError:
-        raise
-    except Exception as error:  # it raises whatever numpy or struct meet in its way
-        raise ReadError(f"{file}: not readable as d3plot ({error}); the file is damaged, copy it again") from error
-    for message in keeper.found.messages:
-        last = " ".join(message.strip().splitlines()[-1].split())
-        raise ReadError(f"{file}: not fully understood as d3plot ({last}); the file is damaged or of an unknown kind")

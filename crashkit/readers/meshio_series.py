@@ -20,7 +20,8 @@ from crashkit.errors import CrashkitError, ReadError
 from crashkit.readers import register
 from crashkit.readers._checks import reading, require_options
 from crashkit.readers._folders import runs_in
-from crashkit.readers._grid import Grid, GridRun, WholeStates
+from crashkit.readers._grid import Grid, WholeStates
+from crashkit.readers._grid_run import GridRun
 from crashkit.readers.base import Run, Runs
 
 _XDMF = re.compile(rb"<Xdmf[\s>]")

@@ -29,7 +29,8 @@ from crashkit.errors import CrashkitError, ReadError
 from crashkit.readers import register
 from crashkit.readers._checks import holds_positions, reading, require_options
 from crashkit.readers._folders import runs_in
-from crashkit.readers._grid import Grid, GridRun, GridSource, Place
+from crashkit.readers._grid import Grid, GridSource, Place
+from crashkit.readers._grid_run import GridRun
 from crashkit.readers._vtk_process import point_array_names, read_xml
 from crashkit.readers.base import Run, Runs
 

@@ -26,7 +26,8 @@ from crashkit.errors import CrashkitError, ReadError
 from crashkit.readers import register
 from crashkit.readers._checks import reading, require_options
 from crashkit.readers._folders import runs_in
-from crashkit.readers._grid import Grid, GridRun, WholeStates
+from crashkit.readers._grid import Grid, WholeStates
+from crashkit.readers._grid_run import GridRun
 from crashkit.readers._vtk_legacy import is_legacy, legacy_field_data, read_legacy
 from crashkit.readers._vtk_process import read_xml
 from crashkit.readers.base import Run, Runs

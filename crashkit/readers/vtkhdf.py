@@ -21,7 +21,8 @@ from crashkit.errors import ReadError
 from crashkit.readers import register
 from crashkit.readers._checks import LIBRARY_ERRORS, reading, require_options
 from crashkit.readers._folders import runs_in
-from crashkit.readers._grid import Grid, GridRun, GridSource, Place
+from crashkit.readers._grid import Grid, GridSource, Place
+from crashkit.readers._grid_run import GridRun
 from crashkit.readers.base import Run, Runs
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"

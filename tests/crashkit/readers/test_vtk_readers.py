@@ -83,7 +83,7 @@ def test_what_this_package_writes_is_read_back(tmp_path, only_run, sample, suffi
     np.testing.assert_array_equal(run.field("plastic_strain", 1, 3), strain[1:])
     np.testing.assert_array_equal(run.alive(0, 3), alive)
     assert set(run.fields) == {"plastic_strain"}
-    assert run.units == ("SI" if not deform else None)
+    assert run.units == "SI"
     assert run.problems == ()
 
 
