@@ -139,6 +139,53 @@ def test_deleted_elements_are_not_alive(solids, only_run):
     assert np.argwhere(~run.alive_cells(0, 5)).tolist() == [[3, 2]]
 
 
+def test_where_nodes_are_deleted_their_elements_are_not_alive(solids, only_run):
+    """MDLOPT = 1: one word a node instead of one an element."""
+    first = only_run(solids)._file.blocks["solid_alive"][0]
+    overwrite(solids / "d3plot", 4 * 36, -5, "<i4")
+    for number in range(1, 6):
+        file = solids / f"d3plot{number:02d}"
+        words = np.fromfile(file, "<f4")
+        nodes = np.ones(106, "<f4")
+        nodes[60] = number < 4
+        np.concatenate([words[:first], nodes, [np.float32(-999999)], np.zeros(50)]).astype("<f4").tofile(file)
+    run = only_run(solids)
+    assert run.problems == ()
+    touched = (run.mesh.face_nodes == 60).any(axis=1)
+    assert touched.any()
+    np.testing.assert_array_equal(run.alive(0, 5), [[True] * 16] * 3 + [(~touched).tolist()] * 2)
+
+
+def test_thick_shells_are_hexahedra(solids, only_run):
+    """The solids of the run, announced as thick shells."""
+    expected = only_run(solids).mesh
+    file = solids / "d3plot"
+    words = np.fromfile(file, "<i4")
+    for solid, thick in ((23, 40), (24, 41), (27, 42)):  # numbers of elements, of materials, of variables
+        words[[solid, thick]] = [0, words[solid]]
+    numbering = 128 + 3 * 106 + 9 * 16 + 5 * 16
+    words[numbering + np.array([6, 9])] = [0, 16]
+    ids = numbering + 16 + 106
+    words[ids : ids + 32] = np.roll(words[ids : ids + 32], 16)  # those of thick shells stand behind the shells'
+    words.tofile(file)
+    run = only_run(solids)
+    assert run.problems == ()
+    np.testing.assert_array_equal(run.mesh.cell_nodes, expected.cell_nodes)
+    np.testing.assert_array_equal(run.mesh.cell_id, expected.cell_id)
+    np.testing.assert_array_equal(run.mesh.cell_part, expected.cell_part)
+    assert {"tshell_stress", "tshell_plastic_strain"} <= set(run.fields)
+    assert run.alive_cells(0, 5).all()
+
+
+def test_variables_that_do_not_add_up_are_not_guessed(solids, only_run):
+    """Words of other variables (neips) make lasso-python warn that its fields might be wrong."""
+    overwrite(solids / "d3plot", 4 * 35, 2, "<i4")
+    run = only_run(solids)
+    np.testing.assert_array_equal(run.displacement(0, 1), np.zeros((1, 106, 3)))
+    with pytest.raises(ReadError, match=r"Shell variables might be wrong"):
+        run.field("plastic_strain", 0, 1)
+
+
 def test_the_end_time_is_taken_from_a_deck_beside(solids, only_run):
     assert only_run(solids).end_time is None
     (solids / "main.k").write_text("*KEYWORD\n*CONTROL_TERMINATION\n$   endtim\n     0.025         0\n*END\n")

@@ -197,3 +197,131 @@ def test_a_position_that_is_no_number_is_named(plain, only_run):
     file.write_bytes(content)
     with pytest.raises(ReadError, match="kartA002, state 1, byte 323: the position of entry 99 is not a finite number"):
         only_run(plain).displacement(0, 2)
+
+
+def write_animation(file: Path, time: float, lift: float, dead_beam: bool = False) -> None:
+    """A file with every section of the format: 2 shells, 2 solids, 1 beam, 1 particle, masses, tree, time history.
+
+    The wedge and the tetrahedron are hexahedra with repeated nodes, as the solver writes them.
+    """
+
+    def ints(*values: int) -> bytes:
+        return np.array(values, ">i4").tobytes()
+
+    def floats(values: object) -> bytes:
+        return np.asarray(values, ">f4").tobytes()
+
+    def texts(width: int, *values: str) -> bytes:
+        return b"".join(v.encode().ljust(width, b"\0") for v in values)
+
+    nodes = 10
+    position = np.arange(30.0).reshape(nodes, 3) ** 1.5
+    position[:, 2] += lift
+    out = [
+        b"\0\0\x54\x2c",
+        floats(time),
+        texts(81, "Time=", "ModAnim", "Radioss Run="),
+        ints(1, 1, 1, 1, 1, 1, 0, 1, 0, 0),
+    ]
+    out += [ints(nodes, 2, 2, 1, 1, 2, 1, 1), np.zeros(6, ">u2").tobytes(), floats(position)]
+    out += [ints(0, 1, 2, 3, 3, 2, 4, 4), b"\1\1", ints(1, 2), texts(50, "  7:door", "  3:rail"), bytes(6 * nodes)]
+    out += [texts(81, "Time Step", "Thickness"), floats(np.full(nodes, 1e-6)), floats([1.5, 2.5])]
+    out += [
+        texts(81, "Velocity", "Displacement"),
+        floats(np.full((nodes, 3), 9)),
+        floats(np.full((nodes, 3), [0, 0, lift])),
+    ]
+    out += [texts(81, "Stress (upper)"), floats([[1, 2, 3], [4, 5, 6]])]
+    out += [floats(np.ones(2)), floats(np.ones(nodes)), ints(*range(101, 111)), ints(11, 12), ints(*[0] * 6)]
+    # solids
+    out += [
+        ints(2, 1, 1, 1),
+        ints(0, 1, 2, 3, 4, 4, 7, 7, 5, 6, 7, 7, 8, 8, 8, 8),
+        b"\1\1",
+        ints(2),
+        texts(50, "  5:block"),
+    ]
+    out += [texts(81, "Plastic Strain"), floats([0.25, 0.75]), texts(81, "Stress"), floats(np.arange(12))]
+    out += [floats([1, 1]), ints(21, 22), ints(0, 0, 0)]
+    # beams
+    out += [ints(1, 1, 1, 1, 1), ints(8, 9), bytes([not dead_beam]), ints(1), texts(50, "  9:strut")]
+    out += [
+        texts(81, "Axial Force"),
+        floats([-4]),
+        texts(81, "Force"),
+        floats(np.arange(9)),
+        ints(0),
+        floats([1]),
+        ints(31),
+    ]
+    out += [ints(0, 0, 0)]
+    # tree, time history
+    out += [ints(1), texts(50, "all"), ints(-1), ints(0), ints(2, 1, 2), ints(1, 1), ints(1, 1), ints(1, 1)]
+    out += [texts(50, "steel"), ints(1), texts(50, "shell"), ints(1)]
+    out += [ints(1, 0, 0, 1), ints(5), texts(50, "node 5"), ints(31), texts(50, "strut")]
+    # particles
+    out += [ints(1, 1, 1, 0), ints(4), b"\1", ints(1), texts(50, "  8:tank"), texts(81, "Density"), floats([1000])]
+    out += [floats([1]), ints(105), ints(0, 0, 0)]
+    file.write_bytes(b"".join(out))
+
+
+@pytest.fixture
+def every_section(tmp_path) -> Path:
+    write_animation(tmp_path / "carA001", 0.0, 0.0)
+    write_animation(tmp_path / "carA002", 1.0, 0.5, dead_beam=True)
+    return tmp_path
+
+
+def test_solids_beams_and_particles_are_cells(every_section, only_run):
+    run = only_run(every_section)
+    mesh = run.mesh
+    assert run.problems == ()
+    assert [(p.id, p.name) for p in mesh.parts] == [(7, "door"), (3, "rail"), (5, "block"), (9, "strut"), (8, "tank")]
+    assert mesh.face_nodes.tolist() == [[0, 1, 2, 3], [3, 2, 4, -1]]
+    assert mesh.face_part.tolist() == [0, 1]
+    assert mesh.cell_type.tolist() == [13, 10, 3, 1]  # wedge, tetrahedron, line, vertex
+    assert mesh.cell_part.tolist() == [2, 2, 3, 4]
+    assert mesh.cell_id.tolist() == [21, 22, 31, 105]
+    assert [sorted(n for n in c if n >= 0) for c in mesh.cell_nodes.tolist()] == [
+        [0, 1, 2, 3, 4, 7],
+        [5, 6, 7, 8],
+        [8, 9],
+        [4],
+    ]
+    assert mesh.node_id.tolist() == list(range(101, 111))
+
+
+def test_fields_of_every_kind_are_missing_on_the_others(every_section, only_run):
+    run = only_run(every_section)
+    nan = np.nan
+    np.testing.assert_array_equal(run.field("thickness", 0, 1), [[1.5, 2.5]])
+    np.testing.assert_array_equal(run.field("stress_upper", 0, 1), [[[1, 2, 3], [4, 5, 6]]])
+    np.testing.assert_array_equal(run.field("solid_plastic_strain", 1, 2), [[0.25, 0.75, nan, nan]])
+    np.testing.assert_array_equal(run.field("beam_axial_force", 0, 1), [[nan, nan, -4, nan]])
+    np.testing.assert_array_equal(run.field("sph_density", 0, 1), [[nan, nan, nan, 1000]])
+    assert run.fields["solid_stress"].components == 6
+    assert run.fields["beam_axial_force"].quantity == "force"
+    assert "displacement" not in run.fields
+
+
+def test_dead_beams_are_told(every_section, only_run):
+    run = only_run(every_section)
+    assert run.alive_cells(0, 2).tolist() == [[True] * 4, [True, True, False, True]]
+    assert run.alive(0, 2).all()
+    np.testing.assert_allclose(run.displacement(1, 2)[0], np.full((10, 3), [0, 0, 0.5]), atol=1e-5)
+
+
+def test_a_file_cut_short_in_any_section_is_refused(every_section, only_run):
+    file = every_section / "carA001"
+    whole = file.read_bytes()
+    for length in range(0, len(whole) - 1, 5):
+        file.write_bytes(whole[:length])
+        with pytest.raises(ReadError, match="carA00"):
+            only_run(every_section)
+
+
+def test_bytes_behind_the_end_are_a_problem(every_section, only_run):
+    for number in (1, 2):
+        file = every_section / f"carA00{number}"
+        file.write_bytes(file.read_bytes() + b"\0" * 8)
+    assert "8 bytes behind byte" in only_run(every_section).problems[0]
