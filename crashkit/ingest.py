@@ -321,7 +321,7 @@ def _with_dask(jobs: _Jobs, layout: Layout, workers: int, scheduler: str | None)
         try:
             if scheduler is None:
                 cluster = LocalCluster(
-                    n_workers=min(workers, len(jobs)), threads_per_worker=1, dashboard_address=None, host="127.0.0.1",
+                    n_workers=min(workers, len(jobs)), threads_per_worker=1, dashboard_address=":0", host="127.0.0.1",
                     local_directory=folder, memory_limit=0, silence_logs=logging.CRITICAL,
                 )  # fmt: skip
             client = Client(cluster if cluster is not None else scheduler, timeout=30)

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 SUFFIXES = (".zarr", ".nc")
+_KEYS = {"name": "default", "separator": "."}  # one folder an array, not one a chunk
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ def create_arrays(store: Path, specs: Sequence[ArraySpec], runs: int) -> dict[st
     out = {}
     for spec in specs:
         # LZ4 behind a byte shuffle keeps pace with the disk; what compresses better writes at half the speed or less.
-        array = group.create_array(
+        out[spec.name] = group.create_array(
             spec.name,
             shape=(runs, *spec.shape),
             chunks=(1, *spec.chunks),
@@ -95,10 +96,9 @@ def create_arrays(store: Path, specs: Sequence[ArraySpec], runs: int) -> dict[st
             fill_value=spec.fill,
             compressors=BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"),
             dimension_names=("sim", *spec.dims),
-            chunk_key_encoding={"name": "default", "separator": "."},  # one folder an array, not one a chunk
+            chunk_key_encoding=_KEYS,
+            attributes=dict(spec.attributes),
         )
-        array.attrs.update(dict(spec.attributes))
-        out[spec.name] = array
     return out
 
 
@@ -120,11 +120,16 @@ def write_zarr(target: Path, small: xr.Dataset, specs: Sequence[ArraySpec], runs
         values = variable.values
         text = values.dtype.kind in "UOT"
         array = group.create_array(
-            str(name), shape=values.shape, chunks=tuple(max(1, n) for n in values.shape), dtype=str if text else values.dtype,
-            dimension_names=tuple(map(str, variable.dims)), fill_value=np.nan if values.dtype.kind == "f" else None,
-        )  # fmt: skip
+            str(name),
+            shape=values.shape,
+            chunks=tuple(max(1, n) for n in values.shape),
+            dtype=str if text else values.dtype,
+            dimension_names=tuple(map(str, variable.dims)),
+            fill_value=np.nan if values.dtype.kind == "f" else None,
+            chunk_key_encoding=_KEYS,
+            attributes=_coordinates_named(small, str(name), variable.attrs),
+        )
         array[...] = values.astype(object) if text else values
-        array.attrs.update(_coordinates_named(small, str(name), variable.attrs))
     group.attrs.update(small.attrs)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that Zarr 3 does not yet specify what xarray looks for first

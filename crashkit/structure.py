@@ -163,9 +163,8 @@ def _rows(s: Structure, kind: str, place: NDArray[np.int32] | None = None) -> ND
     """One row an element: number, part number, its nodes in the order of their numbers (renumbered by `place`)."""
     nodes, part, number = (getattr(s, f"{kind}_{what}") for what in ("nodes", "part", "id"))
     part_id = np.array([p.id for p in s.parts], np.int64)
-    corners = np.full((len(nodes), max(4, nodes.shape[1])), -1, np.int64)  # triangles are 3 wide where alone
-    corners[:, : nodes.shape[1]] = nodes if place is None else place[nodes]
-    return np.column_stack([number, part_id[part], np.sort(corners, axis=1)]).astype(np.int64)
+    corners = np.sort(nodes if place is None else place[nodes], axis=1)
+    return np.column_stack([number, part_id[part], corners]).astype(np.int64)
 
 
 def _match_elements(what: str, mine: NDArray[np.int64], theirs: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -39,6 +39,8 @@ class Violation:
 def validate(dataset: xr.Dataset, *, values: bool = True) -> list[Violation]:
     """Every violation of the crash dataset layout; an empty list means the dataset is good.
 
+    Values are looked at where the layout is right, and results where the mesh is.
+
     `values=False` looks at names, dimensions, types, units and attributes only and reads no displacement.
     With values, results are read once, a block of nodes of one run at a time, so memory stays small; the checksums
     written at ingest are taken again on the way.
@@ -46,7 +48,9 @@ def validate(dataset: xr.Dataset, *, values: bool = True) -> list[Violation]:
     structural = [v for rule in _STRUCTURE for v in rule(dataset)]
     if structural or not values:
         return structural
-    return [v for rule in _VALUES for v in rule(dataset)]
+    found = [v for rule in _VALUES for v in rule(dataset)]
+    # Which nodes are gone is told by the faces: without good ones the results cannot be judged.
+    return found + ([] if any(_indices(dataset)) else list(_results(dataset)))
 
 
 def _variables(dataset: xr.Dataset) -> Iterator[Violation]:
@@ -260,5 +264,5 @@ def _dims(dims: tuple[str, ...] | tuple[object, ...]) -> str:
 _Rule = Callable[[xr.Dataset], Iterator[Violation]]
 _STRUCTURE: tuple[_Rule, ...] = (_variables, _sizes, _attributes, _roles)
 _VALUES: tuple[_Rule, ...] = (
-    _time, _unique, _indices, _reference, _parameter_values, _completeness, _results,
+    _time, _unique, _indices, _reference, _parameter_values, _completeness,
 )  # fmt: skip
