@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -105,6 +107,7 @@ def rate_curves(
     """
     if len(time) < 4:
         return None
+    _keep_compiled()
     true_curves = [curves(time, u) for u in truths]
     quantities = true_curves[0].quantities if true_curves else ()
     out = {}
@@ -119,6 +122,14 @@ def rate_curves(
     if not out or all(np.isnan(v).all() for v in out.values()):
         return None
     return Ratings(quantities, true_curves[0].cfc, out)
+
+
+def _keep_compiled() -> None:
+    """Let numba keep on disk the two loops of the ratings' time warping, which every process would else compile anew
+    for longer than it takes to rate a campaign. Where there is no place for it, they are compiled as before."""
+    for module, name in (("dtwalign.cost", "_calc_cumsum_matrix_jit"), ("dtwalign.backtrack", "_backtrack_jit")):
+        with contextlib.suppress(ImportError, AttributeError, RuntimeError):
+            getattr(importlib.import_module(module), name).enable_caching()
 
 
 def _rating(truth: Curve, mine: Curve, quantity: str, probe: int) -> float:

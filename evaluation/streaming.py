@@ -65,7 +65,11 @@ def _with_dask(
         if scheduler is None:
             cluster = stack.enter_context(
                 LocalCluster(
-                    n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0
+                    n_workers=workers,
+                    threads_per_worker=1,
+                    processes=True,
+                    dashboard_address="127.0.0.1:0",
+                    memory_limit=0,
                 )
             )
             client = stack.enter_context(Client(cluster))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from crashkit.errors import OutputError
-from evaluation.datacard import summarise, surprise, write_card
+from evaluation.datacard import card_drawings, card_statements, summarise, surprise, write_card
 from evaluation.figures.outliers import robust_score
 
 
@@ -70,31 +70,17 @@ def test_runs_that_are_all_alike_have_no_score():
     assert robust_score(np.ones(5)).tolist() == [0] * 5
 
 
-def test_a_dataset_without_parameters_has_a_card(reference, tmp_path):
+def test_a_dataset_without_parameters_shows_no_coverage(reference):
     plain = replace(reference, parameters=np.empty((12, 0)), parameter_names=(), parameter_units=())
-    text = write_card(plain, tmp_path / "card").read_text(encoding="utf-8")
-    assert "figure-coverage" not in text
-    assert "figure-envelopes" in text
+    names = [kind.name for kind, _ in card_drawings(plain, summarise(plain, count=5))]
+    assert names == ["envelopes", "singular_values", "outliers"]
 
 
-def test_a_single_run_has_a_card(reference, tmp_path):
+def test_a_single_run_has_no_outliers(reference):
     one = replace(reference, runs=("only",), parameters=reference.parameters[:1])
-    text = write_card(one, tmp_path / "card").read_text(encoding="utf-8")
-    assert "figure-outliers" not in text
-    assert "1 runs for 3 parameters" in text
-
-
-def test_an_earlier_card_is_replaced_and_anything_else_left_alone(reference, tmp_path):
-    few = replace(reference, runs=reference.runs[:2], parameters=reference.parameters[:2])
-    write_card(few, tmp_path / "card")
-    (tmp_path / "card" / "old.txt").write_text("x")
-    write_card(few, tmp_path / "card")
-    assert not (tmp_path / "card" / "old.txt").exists()
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "notes.txt").write_text("keep")
-    with pytest.raises(OutputError, match=r"exists and holds no card\.json"):
-        write_card(few, tmp_path / "mine")
-    assert (tmp_path / "mine" / "notes.txt").read_text() == "keep"
+    summary = summarise(one, count=5)
+    assert [kind.name for kind, _ in card_drawings(one, summary)] == ["envelopes", "coverage", "singular_values"]
+    assert any("1 runs for 3 parameters" in s.text for s in card_statements(one, summary))
 
 
 def test_a_card_that_fails_leaves_nothing(reference, tmp_path):

@@ -33,7 +33,7 @@ def test_a_scheduler_out_of_reach_is_an_error_that_says_what_to_do():
 def test_a_scheduler_does_the_work():
     from distributed import LocalCluster
 
-    with LocalCluster(n_workers=1, processes=False, dashboard_address=None) as cluster:
+    with LocalCluster(n_workers=1, processes=False, dashboard_address="127.0.0.1:0") as cluster:
         assert over_runs(double, [1, 2], scheduler=cluster.scheduler_address) == [2, 4]
 
 
