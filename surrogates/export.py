@@ -6,6 +6,7 @@ displacement (batch, node, 3) float32, m, on the level's nodes, or on the full m
 
 from __future__ import annotations
 
+import itertools
 import logging
 import warnings
 from collections.abc import Iterator
@@ -58,10 +59,10 @@ def export(surrogate: Surrogate, path: str | Path, level: int | None = None, *, 
         )
     number = min(surrogate.core.numbers) if level is None else level
     lift = Upsampling(surrogate.graphs.to_full(number), "static") if full and number else None
-    parameters, time = _probes(surrogate)
+    program = LevelProgram(surrogate.core, number, lift).eval()
+    parameters, time = _probes(surrogate, _batch_unlike(program))
     states = surrogate.predict_full if full else surrogate.predict
     wanted = np.stack([states(p, t[None], number)[0] for p, t in zip(parameters, time, strict=True)])
-    program = LevelProgram(surrogate.core, number, lift).eval()
     beside = path.with_name(f".{path.name}.part{path.suffix}")
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -112,15 +113,20 @@ def _write_program(
     return program(torch.from_numpy(parameters), torch.from_numpy(time)).detach().numpy()
 
 
-def _probes(surrogate: Surrogate) -> tuple[np.ndarray, np.ndarray]:
-    """Ends and middle of every range, and points drawn between them: (9, parameter) and (9,)."""
+def _probes(surrogate: Surrogate, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Ends and middle of every range, and points drawn between them: (count, parameter) and (count,)."""
     ranges = surrogate.record.ranges
     low, high = np.append(ranges.low, ranges.time[0]), np.append(ranges.high, ranges.time[1])
-    share = np.concatenate(
-        [np.array([[0.0], [0.5], [1.0]]) + np.zeros(len(low)), np.random.default_rng(0).random((6, len(low)))]
-    )
+    fixed = np.array([[0.0], [0.5], [1.0]]) + np.zeros(len(low))
+    share = np.concatenate([fixed, np.random.default_rng(0).random((count - 3, len(low)))])
     at = low + share * (high - low)
     return np.ascontiguousarray(at[:, :-1]), np.ascontiguousarray(at[:, -1])
+
+
+def _batch_unlike(program: nn.Module) -> int:
+    """A batch size that is no size of any tensor inside: torch.export takes equal sizes for one and the same."""
+    taken = {size for tensor in (*program.parameters(), *program.buffers()) for size in tensor.shape}
+    return next(k for k in itertools.count(9) if k not in taken)
 
 
 @contextmanager

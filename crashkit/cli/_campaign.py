@@ -8,22 +8,28 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import numpy as np
-    import xarray as xr
     from numpy.typing import NDArray
 
-    from surrogates.data import Campaign
+    from surrogates.data import Campaign, GraphLevel
 
 
 class RunField:
-    """Displacements (sim, state, node, 3) of chosen runs, m; a run is read when it is asked for."""
+    """Displacements (sim, state, node, 3) of chosen runs, m; a run is read when it is asked for.
 
-    def __init__(self, displacement: xr.DataArray, runs: Sequence[int]) -> None:
-        self._displacement = displacement
+    The file is opened for each run: NetCDF's library crashes on texts in files that are open twice, and the hierarchy
+    is read from the same file in between.
+    """
+
+    def __init__(self, path: Path, runs: Sequence[int], states: int, nodes: int) -> None:
+        self._path = path
         self._runs = list(runs)
-        self.shape = (len(self._runs), *displacement.shape[1:])
+        self.shape = (len(self._runs), states, nodes, 3)
 
     def __getitem__(self, run: int) -> NDArray[np.float32]:
-        return self._displacement.isel(sim=self._runs[run]).values
+        from crashkit.dataset import open_dataset
+
+        with open_dataset(self._path) as dataset:
+            return dataset["displacement"].isel(sim=self._runs[run]).values
 
 
 def open_campaign(path: str | Path, test: Any = None) -> Campaign:
@@ -37,12 +43,14 @@ def open_campaign(path: str | Path, test: Any = None) -> Campaign:
 
     from crashkit.dataset import open_dataset, runs_of
     from crashkit.errors import DataError
-    from crashkit.mesh.store import level_displacement, read_hierarchy
-    from data_schema import parameters
-    from surrogates.data import Campaign, GraphLevel
+    from crashkit.mesh.store import level_displacement
+    from data_schema import fields, parameters
+    from surrogates.data import Campaign
 
     path = Path(path)
-    dataset = open_dataset(path)
+    with open_dataset(path) as opened:
+        dataset = opened.drop_vars("displacement").drop_vars(fields(opened)).load()
+        states, nodes = opened.sizes["time"], opened.sizes["node"]
     runs = [str(n) for n in dataset["sim"].values]
     held_out = [] if test is None else runs_of(runs, test)
     chosen = [k for k in range(len(runs)) if k not in set(held_out)]
@@ -51,17 +59,11 @@ def open_campaign(path: str | Path, test: Any = None) -> Campaign:
     names = parameters(dataset)
     if not names:
         raise DataError(f"{path}: no run has a parameter; give them with crashkit ingest --params")
-    try:
-        stored = read_hierarchy(path).levels
-    except DataError as error:
-        if "has no mesh hierarchy" not in str(error):
-            raise
-        stored = ()
-    levels = tuple(GraphLevel(k.index, k.kept, k.faces, k.edges, k.in_finer, k.to_finer, k.to_full) for k in stored)
     at = dataset["reference_position"]
+    coarse = _levels(path)
 
     def displacement(level: int) -> Any:
-        return RunField(dataset["displacement"], chosen) if level == 0 else level_displacement(path, level, chosen)
+        return RunField(path, chosen, states, nodes) if level == 0 else level_displacement(path, level, chosen)
 
     return Campaign(
         parameters=np.stack([dataset[n].values[chosen].astype(np.float64) for n in names], axis=1),
@@ -69,8 +71,8 @@ def open_campaign(path: str | Path, test: Any = None) -> Campaign:
         parameter_units=tuple(str(dataset[n].attrs.get("units", "")) for n in names),
         time=dataset["time"].values.astype(np.float64),
         displacement=displacement,
-        n_nodes=dataset.sizes["node"],
-        levels=levels,
+        n_nodes=nodes,
+        levels=coarse,
         full_edges=dataset.crash.edges(),
         runs=tuple(runs[k] for k in chosen),
         checksum=str(dataset.attrs.get("checksum", "")),
@@ -79,3 +81,18 @@ def open_campaign(path: str | Path, test: Any = None) -> Campaign:
         points=np.asarray((at.isel(sim=0) if "sim" in at.dims else at).values, np.float64),
         faces=dataset["face_nodes"].values.astype(np.int32),
     )
+
+
+def _levels(path: Path) -> tuple[GraphLevel, ...]:
+    """The hierarchy as the surrogates take it; empty where the dataset has none."""
+    from crashkit.errors import DataError
+    from crashkit.mesh.store import read_hierarchy
+    from surrogates.data import GraphLevel
+
+    try:
+        stored = read_hierarchy(path).levels
+    except DataError as error:
+        if "has no mesh hierarchy" in str(error):
+            return ()
+        raise
+    return tuple(GraphLevel(k.index, k.kept, k.faces, k.edges, k.in_finer, k.to_finer, k.to_full) for k in stored)

@@ -57,7 +57,7 @@ def train(
     from crashkit.cli._campaign import open_campaign
     from surrogates.checkpoints import Checkpoints
     from surrogates.config import settings
-    from surrogates.errors import Diverged
+    from surrogates.errors import Diverged, SurrogateError
     from surrogates.storage import save
     from surrogates.train import train as fit
 
@@ -80,9 +80,11 @@ def train(
 
         try:
             surrogate = fit(campaign, chosen, device=device, report=tell, keeper=keeper)
-        except Diverged as error:
-            if error.surrogate is not None and first:
+        except SurrogateError as error:
+            if first and isinstance(error, Diverged) and error.surrogate is not None:
                 save(error.surrogate, output, overwrite=overwrite)
+            if first and not resume:
+                keeper.discard()
             raise
         if first:
             save(surrogate, output, overwrite=overwrite)

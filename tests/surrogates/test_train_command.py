@@ -1,0 +1,280 @@
+"""`crashkit train`, `predict` and `export` on a small dataset: what they write, say, and refuse."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from pathlib import Path
+
+import numpy as np
+import plate
+import pytest
+import xarray as xr
+from typer.testing import CliRunner
+
+import crashkit
+from crashkit.cli import app
+from crashkit.cli.predict import predict
+from crashkit.errors import DataError
+from crashkit.mesh.levels import Hierarchy, Level
+from crashkit.mesh.store import write_hierarchy
+from crashkit.paraview import read_state
+from surrogates.config import settings
+from surrogates.model import Surrogate
+from surrogates.storage import load
+from surrogates.train import train
+
+UNITS = {"impact_speed": "m s-1", "impact_angle": "degree", "yield_stress": "Pa"}
+ASKED = {"impact_speed": 20.0, "impact_angle": "5deg", "yield_stress": "400 MPa"}
+
+
+def dataset(runs: int = 10) -> xr.Dataset:
+    mu = plate.parameters(runs)
+    return xr.Dataset(
+        {
+            "displacement": (("sim", "time", "node", "xyz"), plate.displacement(mu), {"units": "m"}),
+            "reference_position": (("node", "xyz"), plate.grid(9), {"units": "m"}),
+            "node_id": ("node", np.arange(1, 82)),
+            "face_nodes": (("face", "corner"), plate.quads(9)),
+            "face_part": ("face", np.zeros(64, np.int32)),
+            "part_id": ("part", [7]),
+            "part_name": ("part", np.array(["plate"], "O")),
+            **{n: ("sim", mu[:, k], {"units": u, "role": "parameter"}) for k, (n, u) in enumerate(UNITS.items())},
+        },
+        coords={"sim": [f"run_{k:03d}" for k in range(runs)], "time": ("time", plate.TIME, {"units": "s"})},
+        attrs={"checksum": "abc", "solver": "plate"},
+    )
+
+
+def hierarchy() -> Hierarchy:
+    levels = tuple(
+        Level(k.index, k.kept, k.faces, k.edges, k.in_finer, k.to_finer, k.to_full, np.zeros(81))
+        for k in plate.levels()
+    )
+    return Hierarchy(81, levels, {})
+
+
+@pytest.fixture(scope="module")
+def crash(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("data") / "crash.nc"
+    dataset().to_netcdf(path)
+    write_hierarchy(path, hierarchy())
+    return path
+
+
+@pytest.fixture(scope="module")
+def model(crash: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("models") / "mh"
+    crashkit.train(crash, folder, "mh", overrides=["level.epochs=2"], test="8:10", device="cpu")
+    return folder
+
+
+def run(*arguments: object) -> tuple[int, str, str]:
+    result = CliRunner().invoke(app, [*map(str, arguments)])
+    return result.exit_code, result.stdout, result.stderr
+
+
+def test_training_stores_a_model_that_has_not_seen_the_test_runs(crash: Path, tmp_path: Path) -> None:
+    code, out, _ = run(
+        "train",
+        crash,
+        "-o",
+        tmp_path / "m",
+        "--epochs",
+        2,
+        "--seed",
+        3,
+        "--test",
+        "8:10",
+        "--set",
+        "level.latent=3",
+        "--json",
+    )
+    assert code == 0
+    told = json.loads(out)
+    assert told["held_out_runs"] == ["run_008", "run_009"]
+    assert set(told["training_runs"]) | set(told["validation_runs"]) == {f"run_{k:03d}" for k in range(8)}
+    stored = load(tmp_path / "m")
+    assert stored.level_names == {"MH2": 2, "MH1": 1}
+    assert (stored.record.seed, stored.n_latent(1), stored.record.fits[1].epochs) == (3, 3, 2)
+    assert [p.name for p in tmp_path.iterdir()] == ["m"]
+
+
+def test_what_is_trained_from_disk_is_what_is_trained_from_arrays(crash: Path, model: Path) -> None:
+    stored = load(model)
+    campaign = plate.campaign(
+        8, parameters=plate.parameters(10)[:8], displacement=of_level(plate.displacement(plate.parameters(10))[:8])
+    )
+    expected = train(campaign, settings("mh", overrides=["level.epochs=2"]))
+    mu = plate.parameters(1, seed=2)[0]
+    np.testing.assert_array_equal(stored.predict(mu), expected.predict(mu))
+
+
+def of_level(u: np.ndarray):  # type: ignore[no-untyped-def]
+    return lambda level: u if level == 0 else u[:, :, plate.levels()[level - 1].kept]
+
+
+def test_progress_names_epoch_losses_rate_and_time_left(crash: Path, tmp_path: Path) -> None:
+    code, _, err = run("train", crash, "-o", tmp_path / "m", "--model", "podnn", "--epochs", 2, "--test", "8:10")
+    assert code == 0
+    line = next(line for line in err.splitlines() if line.startswith("PODNN 2/2"))
+    for word in ("total", "approximation", "reconstruction", "validation", "epochs/s", "s left"):
+        assert word in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--model", "mhh"), "model 'mhh' is not known"),
+        (("--set", "level.epoch=3"), "level.epoch is not a setting"),
+        (("--test", "0:10"), "all 10 runs would be test runs"),
+        (("--test", "run_777"), "there is no run 'run_777'"),
+        (("--device", "tpu"), "device 'tpu' is not known"),
+        (("--resume",), "holds no training to go on from"),
+        (("--config", "nothing.yaml"), "nothing.yaml"),
+    ],
+)
+def test_a_wrong_wish_is_one_line_and_leaves_nothing(
+    crash: Path, tmp_path: Path, arguments: tuple[str, ...], message: str
+) -> None:
+    code, _, err = run("train", crash, "-o", tmp_path / "m", *arguments)
+    assert code == 1
+    assert len(err.strip().splitlines()) == 1
+    assert message in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_dataset_without_hierarchy_is_refused(tmp_path: Path) -> None:
+    dataset().to_netcdf(tmp_path / "bare.nc")
+    code, _, err = run("train", tmp_path / "bare.nc", "-o", tmp_path / "m")
+    assert code == 1
+    assert "no mesh hierarchy" in err
+    assert "crashkit coarsen" in err
+    assert not (tmp_path / "m").exists()
+
+
+def test_a_missing_or_foreign_dataset_is_refused(tmp_path: Path) -> None:
+    assert "no such dataset" in run("train", tmp_path / "none.zarr", "-o", tmp_path / "m")[2]
+    (tmp_path / "text.nc").write_text("hello")
+    code, _, err = run("train", tmp_path / "text.nc", "-o", tmp_path / "m")
+    assert code == 1
+    assert "cannot be opened as a dataset" in err
+
+
+def test_a_model_that_is_there_stays_unless_asked(crash: Path, model: Path) -> None:
+    before = (model / "model.json").read_bytes()
+    code, _, err = run("train", crash, "-o", model, "--epochs", 1)
+    assert code == 1
+    assert "holds a model already" in err
+    assert (model / "model.json").read_bytes() == before
+
+
+def test_another_folder_is_not_written_over(crash: Path, tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("years")
+    code, _, err = run("train", crash, "-o", tmp_path, "--overwrite")
+    assert code == 1
+    assert "is no model folder" in err
+
+
+@pytest.mark.parametrize("name", ["run.pvd", "run.vtkhdf"])
+def test_a_prediction_is_written_for_paraview(model: Path, tmp_path: Path, name: str) -> None:
+    code, _, err = run(*asked(model), "--full", "-o", tmp_path / name)
+    assert code == 0, err
+    time, mesh = read_state(tmp_path / name, -1)
+    assert time == pytest.approx(0.03)
+    surrogate = load(model)
+    expected = surrogate.predict_full([20.0, 5.0, 4e8], [0.03])[0]
+    np.testing.assert_allclose(mesh.point_data["displacement"], expected, atol=1e-6)
+    assert mesh.n_cells == 64
+
+
+def asked(model: Path) -> tuple[object, ...]:
+    return ("predict", model, *(part for n, v in ASKED.items() for part in ("--param", f"{n}={v}")))
+
+
+def test_a_coarse_state_becomes_one_file(model: Path, tmp_path: Path) -> None:
+    assert run(*asked(model), "--level", 2, "--time", 0.015, "-o", tmp_path / "state.vtu")[0] == 0
+    assert [p.name for p in tmp_path.iterdir()] == ["state.vtu"]
+
+
+def test_arrays_carry_nodes_and_times(model: Path, tmp_path: Path) -> None:
+    assert run(*asked(model), "--level", 2, "-o", tmp_path / "run.npz")[0] == 0
+    with np.load(tmp_path / "run.npz") as stored:
+        assert stored["displacement"].shape == (7, 9, 3)
+        np.testing.assert_array_equal(stored["node"], plate.levels()[1].kept)
+        np.testing.assert_array_equal(stored["reference_position"], plate.grid(9)[plate.levels()[1].kept])
+
+
+def test_parameters_in_other_units_are_the_same(model: Path) -> None:
+    plain = predict(model, {"impact_speed": 20, "impact_angle": 5, "yield_stress": 4e8})
+    units = predict(model, {"impact_speed": "72 km/h", "impact_angle": "5deg", "yield_stress": "0.4GPa"})
+    np.testing.assert_allclose(units, plain, rtol=1e-6, atol=1e-9)
+    assert plain.dims == ("time", "node", "xyz")
+    assert plain.attrs["units"] == "m"
+
+
+def test_outside_the_trained_range_there_is_a_warning_with_the_range(model: Path, tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match=r"impact_speed = 99 m s-1 is outside the trained range 1\d"):
+        predict(model, {**ASKED, "impact_speed": 99})
+    code, _, err = run("predict", model, "--param", "impact_speed=99", *asked(model)[4:], "-o", tmp_path / "run.npz")
+    assert code == 0
+    assert "warning: impact_speed = 99 m s-1 is outside the trained range" in err
+
+
+def test_inside_the_trained_range_there_is_none(model: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert predict(model, ASKED).attrs["warnings"] == ""
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"speed": 3}, r"'speed' is not known; the model takes impact_speed \(.* m s-1\), impact_angle"),
+        ({"impact_speed": None}, r"impact_speed is missing; the model takes"),
+        ({"impact_speed": "fast"}, "expected a number"),
+        ({"impact_speed": "20 MPa"}, "'MPa' is not one of impact_speed, which is in m s-1"),
+        ({"impact_speed": float("nan")}, "expected a finite number"),
+    ],
+)
+def test_wrong_parameters_are_named(model: Path, change: dict[str, object], message: str) -> None:
+    given = {k: v for k, v in {**ASKED, **change}.items() if v is not None}
+    with pytest.raises(DataError, match=message):
+        predict(load(model), given)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (("-o", "run.stl"), 1, "expected one of .pvd, .vtkhdf"),
+        (("-o", "run.vtu"), 1, "holds one state, and 7 were asked for"),
+        (("-o", "run.npz", "--level", "7"), 1, "level 7 was asked for"),
+        (("-o", "run.npz", "--time", "soon"), 2, "expected seconds"),
+        (("-o", "run.npz", "--param", "impact_speed"), 2, "expected name=value"),
+    ],
+)
+def test_a_wrong_question_is_answered_and_writes_nothing(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], code: int, message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    found, _, err = run(*asked(model), *arguments)
+    assert found == code
+    assert message in " ".join(err.split())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_is_no_model_is_refused(tmp_path: Path) -> None:
+    code, _, err = run("predict", tmp_path / "none", "--param", "a=1")
+    assert code == 1
+    assert "no such model folder" in err
+
+
+def test_export_writes_a_checked_file(model: Path, tmp_path: Path) -> None:
+    code, out, err = run("export", model, "-o", tmp_path / "mh2.pt2", "--level", 2, "--json")
+    assert code == 0, err
+    assert json.loads(out)["relative_difference"] <= 1e-5
+    assert (tmp_path / "mh2.pt2").stat().st_size > 0
+
+
+def test_the_loaded_model_is_a_surrogate(model: Path) -> None:
+    assert isinstance(crashkit.load_model(model), Surrogate)
