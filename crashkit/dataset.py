@@ -138,8 +138,10 @@ def runs_of(names: Sequence[str], chosen: Selection, *, seed: int = 0) -> list[i
         out = list(range(count))[chosen]
     elif isinstance(chosen, (int, float, np.integer, np.floating)):
         size = round(float(chosen) * count) if 0 < chosen < 1 else int(chosen)
-        if not 0 < size < count:
-            raise DataError(f"{chosen} of {count} runs were asked for; expected at least 1 and fewer than {count}")
+        if not 0 < size < count or (chosen > 1 and size != chosen):
+            raise DataError(
+                f"{chosen} of {count} runs were asked for; expected a fraction, or a whole number from 1 to {count - 1}"
+            )
         out = sorted(np.random.default_rng(seed).choice(count, size, replace=False).tolist())
     else:
         out = []

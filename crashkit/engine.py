@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,7 @@ from crashkit import __version__
 from crashkit.dataset import open_dataset
 from crashkit.errors import DataError, ReadError
 from crashkit.readers import reader_for
-from crashkit.readers.base import Run
+from crashkit.readers.base import Run, Runs
 from crashkit.run_view import RunView, gone_nodes
 from crashkit.store import SUFFIXES
 from crashkit.structure import structure_of
@@ -164,28 +164,30 @@ def _flags(view: RunView, place: int) -> Callable[[int, int], NDArray]:
     return read
 
 
-def _the_run(path: Path, wanted: str | int | None, runs: Iterable[Run]) -> Run:
-    """The run asked for; without a wish the only one."""
-    names = []
-    chosen: Run | None = None
-    for place, run in enumerate(runs):
-        names.append(run.name)
-        if chosen is None and wanted in (None, run.name, place):
-            chosen = run
-        else:
-            run.close()
-        if wanted is not None and chosen is not None:
-            return chosen
-    if chosen is not None and len(names) == 1:
-        return chosen
+def _the_run(path: Path, wanted: str | int | None, runs: Iterator[Run]) -> Run:
+    """The run asked for by name or place; without a wish the only one."""
+    if not isinstance(runs, Runs):
+        opened = list(runs)
+        runs = Runs({run.name: partial(_itself, run) for run in opened})
+    names = runs.names
+    if not names:
+        raise ReadError(f"{path}: holds no run")
     listed = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
-    if wanted is None and names:
-        raise DataError(
-            f"{path}: holds {len(names)} runs ({listed}); name one with run=, or join them with crashkit ingest"
-        )
-    if names:
+    if wanted is None:
+        if len(names) > 1:
+            raise DataError(
+                f"{path}: holds {len(names)} runs ({listed}); name one with run=, or join them with crashkit ingest"
+            )
+        return runs.open(names[0])
+    if isinstance(wanted, int) and -len(names) <= wanted < len(names):
+        return runs.open(names[wanted])
+    if wanted not in names:
         raise DataError(f"{path}: holds no run {wanted!r}; it has {listed}")
-    raise ReadError(f"{path}: holds no run")
+    return runs.open(str(wanted))
+
+
+def _itself(run: Run) -> Run:
+    return run
 
 
 class _Lazy(BackendArray):

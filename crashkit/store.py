@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 SUFFIXES = (".zarr", ".nc")
-_KEYS = {"name": "default", "separator": "."}  # one folder an array, not one a chunk
+_KEYS: Any = {"name": "default", "separator": "."}  # one folder an array, not one a chunk
 
 
 @dataclass(frozen=True)

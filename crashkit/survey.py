@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from crashkit.errors import CrashkitError, DataError, ReadError
 from crashkit.parameter_table import read_parameter_table
 from crashkit.readers import reader_for
-from crashkit.readers.base import FieldInfo, Run
+from crashkit.readers.base import FieldInfo, Run, Runs
 from crashkit.structure import Structure, matched, structure_of
 from data_schema import DIMENSIONS, VARIABLES, to_si, unit_system
 from data_schema.units import UnknownUnits, si_unit
@@ -68,12 +68,14 @@ class Field:
 class Found:
     """One run that can be used; small enough to send to a worker.
 
+    run, index  its name and place in the source; `name` is that in the dataset
     time        (state,) s, its own output times
     parameters  name -> (value, unit), in the dataset's units
     fields      the wanted fields that it has
     """
 
     source: Path
+    run: str
     index: int
     name: str
     solver: str
@@ -170,37 +172,40 @@ def each_run(source: Path, choice: Choice, out: Survey, stop: bool) -> Iterator[
         except ReadError as error:
             if stop:
                 raise
-            out.skipped[f"{source.name}, run {index + 1}"] = str(error)
+            if isinstance(runs, Runs):
+                out.skipped[_named(runs.names[index], source, choice.names)] = str(error)
+            else:
+                out.skipped[f"{source.name}, run {index + 1}"] = str(error)
             continue
         if run is None:
             if index == 0:
                 raise ReadError(f"{source}: holds no run")
             return
-        yield index, _named(run, source, choice.names), run
+        yield index, _named(run.name, source, choice.names), run
 
 
 def reopen(found: Found, choice: Choice) -> Run:
     """The run `found`, opened again where it was found."""
     runs = reader_for(found.source, choice.reader).runs(found.source, **dict(choice.reader_options))
-    pass_over(runs, found.index)
-    run = next(runs, None)
-    if run is None or _named(run, found.source, choice.names) != found.name or len(run.time) != len(found.time):
+    try:
+        run = runs.open(found.run) if isinstance(runs, Runs) else _at(runs, found.index)
+    except KeyError:
+        run = None
+    if run is None or run.name != found.run or len(run.time) != len(found.time):
         raise ReadError(f"{found.source}: run {found.name} has changed since it was first looked at; start again")
     return run
 
 
-def pass_over(runs: Iterator[Run], count: int) -> None:
-    """Leave out the next `count` runs, without opening them where the iterator knows how (`skip`)."""
-    if hasattr(runs, "skip"):
-        runs.skip(count)
-        return
-    for _ in range(count):
+def _at(runs: Iterator[Run], place: int) -> Run | None:
+    """The run at `place` of an iterator that knows no names; those before it are opened on the way."""
+    for _ in range(place):
         try:
-            run = next(runs, None)
+            before = next(runs, None)
         except ReadError:
             continue
-        if run is not None:
-            run.close()
+        if before is not None:
+            before.close()
+    return next(runs, None)
 
 
 def wanted_field(run: Run, name: str, units: str) -> Field | None:
@@ -227,9 +232,9 @@ def cell_fields(run: Run, name: str) -> list[str]:
     return [n for n, info in run.fields.items() if info.location == "cell" and n.endswith(f"_{name}")]
 
 
-def _named(run: Run, source: Path, pattern: str) -> str:
+def _named(run: str, source: Path, pattern: str) -> str:
     try:
-        return pattern.format(run=run.name, source=source.resolve().name.split(".")[0])
+        return pattern.format(run=run, source=source.resolve().name.split(".")[0])
     except (KeyError, IndexError, ValueError) as error:
         raise DataError(
             f"names {pattern!r} not understood ({error}); expected text with {{run}} and {{source}}"
@@ -271,6 +276,7 @@ def _look(run: Run, name: str, source: Path, index: int, choice: Choice, out: Su
         out.note(f"run {name} has no {', '.join(missing)}; it has {', '.join(run.fields) or 'no further field'}")
     return Found(
         source=source,
+        run=run.name,
         index=index,
         name=name,
         solver=run.solver,
