@@ -17,6 +17,7 @@ from crashkit.cli._console import fail, print_json, progress, say, table
 
 if TYPE_CHECKING:
     import numpy as np
+    import xarray as xr
     from numpy.typing import NDArray
 
     from evaluation.predictor import Mesh, Model
@@ -149,21 +150,39 @@ def _keep_modes(pods: Mapping[int, Any], folder: Path) -> dict[int, str]:
 def _opened(dataset: str, models: tuple[str, ...]) -> tuple[Reference, tuple[Model, ...]]:
     """The dataset and the models as evaluation sees them."""
     from crashkit.cli.predict import load_model
-    from crashkit.dataset import open_dataset
-    from crashkit.errors import DataError
+    from crashkit.dataset import has_hierarchy, open_dataset
     from crashkit.mesh.store import read_hierarchy
     from evaluation.reference import reference_of
 
     surrogates = [(Path(folder), load_model(folder)) for folder in models]
-    opened = open_dataset(dataset)
-    try:
-        levels = read_hierarchy(dataset).levels
-    except DataError:
-        if any(number > 0 for _, s in surrogates for number in s.level_names.values()):
-            raise
-        levels = ()
+    opened = open_dataset(dataset, chunks=None)
+    coarse = any(number > 0 for _, s in surrogates for number in s.level_names.values())
+    levels = read_hierarchy(dataset).levels if coarse or has_hierarchy(dataset) else ()
     reference = reference_of(opened, levels, str(opened.attrs.get("checksum", "")))
+    reference = dataclasses.replace(reference, displacement=_reader(dataset, opened))
     return reference, tuple(as_model(surrogate, folder, reference) for folder, surrogate in surrogates)
+
+
+def _reader(path: str, dataset: xr.Dataset) -> Callable[[int], NDArray[np.float32]]:
+    """Reads one run (state, node, 3), m; raises ReadError where it is damaged."""
+    import numpy as np
+
+    from crashkit.dataset import reading
+    from crashkit.errors import ReadError
+
+    erodes = "alive" in dataset or "cell_alive" in dataset
+
+    def read(run: int) -> NDArray[np.float32]:
+        with reading(path):
+            u = np.asarray(dataset["displacement"].isel(sim=run).values)
+        if not erodes and not np.isfinite(u).all():
+            raise ReadError(
+                f"{path}: displacements of run {dataset['sim'].values[run]} are missing though nothing erodes; expected "
+                f"numbers everywhere: see crashkit validate, and ingest the run again"
+            )
+        return u
+
+    return read
 
 
 @dataclass

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from crashkit.cli._console import console, print_json, table
+from crashkit.cli._console import console, print_json, say, table
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -111,16 +111,28 @@ def _levels(path: Path) -> list[dict[str, Any]]:
 def command(
     path: Annotated[Path, typer.Argument(help="Dataset (.zarr or .nc).", show_default=False)],
     as_json: Annotated[bool, typer.Option("--json", help="Print as JSON, in SI units.")] = False,
+    report: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for a data card: coverage, singular values, envelopes, unusual runs.", show_default="none"
+        ),
+    ] = None,
 ) -> None:
     """Print runs, states, time span, mesh, parts, parameters, largest displacement, size, and the mesh hierarchy."""
     from crashkit.dataset import open_dataset, reading
 
     with open_dataset(path, chunks=None) as dataset, reading(path):
         found = describe(dataset, path)
+        if report is not None:
+            from evaluation.datacard import write_card
+
+            found["report"] = write_card(dataset, report, about={"Dataset": path.name})
     if as_json:
         print_json(found)
-    else:
-        _print(found)
+        return
+    _print(found)
+    if report is not None:
+        say(f"data card: {found['report']}")
 
 
 def _print(found: dict[str, Any]) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import zarr
 from typer.testing import CliRunner
 
 from crashkit.dataset import demo_data, open_dataset
@@ -151,6 +152,15 @@ def test_a_model_of_another_dataset_is_refused(campaign, tmp_path):
     _fails(result, "podnn was trained on another dataset")
 
 
+def test_a_run_with_lost_values_is_named(campaign, tmp_path):
+    shutil.copytree(campaign / "kart.zarr", tmp_path / "kart.zarr")
+    name = str(open_dataset(campaign / "kart.zarr")["sim"].values[6])
+    zarr.open_group(tmp_path / "kart.zarr")["displacement"][6, 2:] = np.nan
+    result = run(tmp_path / "kart.zarr", campaign / "podnn", "-o", tmp_path / "report")
+    _fails(result, name, "missing though nothing erodes")
+    assert not (tmp_path / "report").exists()
+
+
 def test_a_hierarchy_made_anew_is_noticed(campaign, tmp_path):
     from crashkit.cli.coarsen import coarsen
 
@@ -220,3 +230,14 @@ def test_an_evaluation_that_breaks_off_leaves_nothing(campaign, tmp_path, monkey
     monkeypatch.setattr("evaluation.figures.ORDER", ("floors",))
     _fails(run(campaign / "kart.zarr", campaign / "podnn", "-o", tmp_path / "report"), "No space left on device")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_info_writes_the_data_card(campaign, tmp_path):
+    from crashkit.cli import app
+
+    result = CliRunner().invoke(
+        app, ["info", str(campaign / "kart.zarr"), "--report", str(tmp_path / "card"), "--json"]
+    )
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["report"] == str(tmp_path / "card" / "card.html")
+    assert "figure-coverage" in (tmp_path / "card" / "card.html").read_text(encoding="utf-8")
