@@ -44,6 +44,7 @@ class LevelSettings(_Frozen):
     channels       of gcn, behind the three coordinates
     order          Chebyshev terms
     hidden         of ae: widths between state and latent vector
+    rate_inputs    0, or: layers that sum over more numbers than this learn slower, in proportion
     start          pod: reduction gcn or ae beside a trainable linear part that starts at POD, its own end at zero
     """
 
@@ -63,6 +64,7 @@ class LevelSettings(_Frozen):
     optimiser: Literal["adamw", "adam", "sgd"] = "adamw"
     weight_decay: Annotated[float, Field(ge=0)] = 0.0
     clip: Annotated[float, Field(ge=0)] = 0.0
+    rate_inputs: Annotated[int, Field(ge=0)] = 0
     weight_approximation: Annotated[float, Field(ge=0)] = 1.0
     weight_reconstruction: Annotated[float, Field(ge=0)] = 1.0
 

@@ -59,6 +59,8 @@ class Gaussian:
         from sklearn.gaussian_process import GaussianProcessRegressor
         from sklearn.utils._testing import ignore_warnings
 
+        if not self._informed:
+            return self
         some = np.random.default_rng(seed).permutation(len(self.x))[:_HYPER]
         compact = _left_factor(y[some] - y.mean(axis=0))
         machine = GaussianProcessRegressor(_kernel(self.x.shape[1]), random_state=seed, n_restarts_optimizer=1)
@@ -70,11 +72,16 @@ class Gaussian:
         """(query, sample): how much each training output enters the prediction at x (query, input)."""
         from scipy.linalg import cho_factor, cho_solve
 
-        if len(self.x) == 1 or self.x.shape[1] == 0:
+        if not self._informed:
             return np.zeros((len(x), len(self.x)))
         kernel = _kernel(self.x.shape[1]).clone_with_theta(self.theta)
         factor = cho_factor(kernel(self.x) + 1e-10 * np.eye(len(self.x)), lower=True)
         return cho_solve(factor, kernel(x, self.x).T).T
+
+    @property
+    def _informed(self) -> bool:
+        """Whether there is anything to tell samples apart by; else the mean is all there is to predict."""
+        return len(self.x) > 1 and self.x.shape[1] > 0
 
     def numbers(self) -> dict[str, NDArray[np.float64]]:
         return {"theta": np.asarray(self.theta, np.float64) if self.theta is not None else np.zeros(0)}

@@ -87,7 +87,7 @@ def split(campaign: Campaign, settings: Settings, notes: Notes) -> Split:
         if len(chosen) == runs:
             raise SurrogateError("validation.runs names all training runs; leave some to train on")
     elif runs < FEWEST_TO_SPLIT:
-        notes.add(f"{runs} training runs are too few to hold any out; weights are chosen on the training runs")
+        notes.add(f"no run can be held out of {runs}; weights are chosen on the training runs")
         return Split(everything, np.empty(0, np.int64))
     else:
         count = min(max(1, round(wish.share * runs)), runs - 1)

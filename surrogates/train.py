@@ -85,17 +85,17 @@ def _fit_regression(surrogate: Surrogate, trainer: Trainer) -> None:
 
 def _fit_unified(surrogate: Surrogate, trainer: Trainer) -> None:
     numbers = level_numbers(trainer.settings, trainer.graphs)
-    network = Unified(scaling(trainer.settings, surrogate.record.ranges), trainer.settings, trainer.graphs, numbers)
-    surrogate.core = network
+    inputs = scaling(trainer.settings, surrogate.record.ranges)
     try:
-        surrogate.record.fits[numbers[-1]] = trainer.unified(network, trainer.graphs)
+        surrogate.record.fits[numbers[-1]] = trainer.unified(surrogate, numbers, inputs)
     except Diverged as error:
         if error.fit is not None and error.fit.best_epoch:
             surrogate.record.fits[numbers[-1]] = error.fit
             error.surrogate = surrogate
         raise
     finally:
-        network.cpu()
+        if isinstance(surrogate.core, Unified):
+            surrogate.core.cpu()
     _judge(surrogate, trainer)
 
 

@@ -16,7 +16,7 @@ from surrogates.data import Campaign
 from surrogates.graphs import Graphs
 from surrogates.inputs import InputScaling
 from surrogates.level import Level
-from surrogates.model import level_name
+from surrogates.model import Surrogate, level_name
 from surrogates.objectives import CHUNK, LatentObjective, LevelObjective, Samples, UnifiedObjective, as_states
 from surrogates.reduction import LinearReduction, LinearStart, linear_part
 from surrogates.samples import Notes, Runs, Split, scale_of
@@ -50,10 +50,11 @@ class Trainer:
         cascade.add(number, level)
         return self._fit(objective, number, level_name(self.settings, number), seed)
 
-    def unified(self, network: Unified, graphs: Graphs) -> Fit:
-        """Train all levels of `network` together."""
-        finest = network.numbers[-1]
+    def unified(self, surrogate: Surrogate, numbers: tuple[int, ...], scaling: InputScaling) -> Fit:
+        """Train levels `numbers` together, and put them on `surrogate`."""
+        finest, graphs = numbers[-1], self.graphs
         seed = self._seeded(finest)
+        network = surrogate.core = Unified(scaling, self.settings, graphs, numbers)
         runs = self.runs(finest, graphs)
         states, held = (runs.samples(part) for part in self._parts)
         network.scale = _divide_by_rms(states, held)

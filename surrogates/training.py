@@ -24,7 +24,6 @@ from surrogates.errors import Diverged, SurrogateError
 HISTORY = (
     "total", "approximation", "reconstruction",
     "validation_total", "validation_approximation", "validation_reconstruction",
-    "learning_rate",
 )  # fmt: skip
 
 
@@ -64,9 +63,9 @@ class Epoch:
 
 @dataclass
 class Fit:
-    """How a training went. `best_epoch` counts from 1; `history` has one value an epoch (HISTORY)."""
+    """How a training went. `best_epoch` counts from 1; `history` has one value an epoch: HISTORY and learning_rate."""
 
-    history: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in HISTORY})
+    history: dict[str, list[float]] = field(default_factory=dict)
     best_epoch: int = 0
     best: float = math.inf
     seconds: float = 0.0
@@ -74,7 +73,7 @@ class Fit:
 
     @property
     def epochs(self) -> int:
-        return len(self.history["total"])
+        return len(self.history.get("total", ()))
 
     @property
     def seconds_per_epoch(self) -> float:
@@ -112,7 +111,7 @@ def fit(
     device = next(objective.parameters()).device
     plan = _Plan(objective.size, settings, seed, device)
     trained = [p for p in objective.parameters() if p.requires_grad]
-    optimiser = _optimiser(trained, settings, device)
+    optimiser = _optimiser(objective, settings, device)
     names = _names(objective)
     out = Fit()
     best: dict[str, Tensor] = {}
@@ -128,12 +127,12 @@ def fit(
                 sums += step(indices, rate)
             measured = _measured(objective, sums / plan.steps, weights)
             out.seconds = spent + time.perf_counter() - started
-            if not all(map(math.isfinite, measured[:3])):
+            if not all(map(math.isfinite, measured.values())):
                 out.status = "diverged"
                 raise _diverged(name, epoch, out)
-            for key, value in zip(HISTORY, (*measured, rate), strict=True):
-                out.history[key].append(value)
-            judged = measured[0] if math.isnan(measured[3]) else measured[3]
+            for key, value in {**measured, "learning_rate": rate}.items():
+                out.history.setdefault(key, []).append(value)
+            judged = measured.get("validation_total", measured["total"])
             if judged < out.best:
                 out.best, out.best_epoch = judged, epoch + 1
                 best = {k: v.detach().clone() for k, v in names.items()}
@@ -225,7 +224,7 @@ class _Step:
 
     def __call__(self, indices: Tensor, rate: float) -> Tensor:
         for group in self.optimiser.param_groups:
-            group["lr"] = rate
+            group["lr"] = rate * group["factor"]
         self.optimiser.zero_grad(set_to_none=True)
         with torch.autocast(indices.device.type, torch.bfloat16) if self.half else contextlib.nullcontext():
             losses = self.objective(indices)
@@ -236,26 +235,40 @@ class _Step:
         return losses.detach()
 
 
-def _optimiser(parameters: list[nn.Parameter], settings: LevelSettings, device: torch.device) -> torch.optim.Optimizer:
+def _optimiser(objective: Objective, settings: LevelSettings, device: torch.device) -> torch.optim.Optimizer:
+    """One group of parameters for each factor on the learning rate."""
+    groups: dict[float, list[nn.Parameter]] = {}
+    for name, parameter in objective.named_parameters():
+        if parameter.requires_grad:
+            factor = min(1.0, settings.rate_inputs / _inputs(name, parameter)) if settings.rate_inputs else 1.0
+            groups.setdefault(factor, []).append(parameter)
     rate, decay = settings.learning_rate, settings.weight_decay
+    given = [{"params": some, "factor": factor} for factor, some in groups.items()]
     fused = device.type in ("cpu", "cuda")
     if settings.optimiser == "adamw":
-        return torch.optim.AdamW(parameters, lr=rate, weight_decay=decay, fused=fused)
+        return torch.optim.AdamW(given, lr=rate, weight_decay=decay, fused=fused)
     if settings.optimiser == "adam":
-        return torch.optim.Adam(parameters, lr=rate, weight_decay=decay, fused=fused)
-    return torch.optim.SGD(parameters, lr=rate, weight_decay=decay, momentum=0.9, fused=fused)
+        return torch.optim.Adam(given, lr=rate, weight_decay=decay, fused=fused)
+    return torch.optim.SGD(given, lr=rate, weight_decay=decay, momentum=0.9, fused=fused)
 
 
-def _measured(objective: Objective, losses: Tensor, weights: Tensor) -> tuple[float, ...]:
-    """Total, approximation, reconstruction of the training and the validation samples (NaN without)."""
+def _inputs(name: str, parameter: nn.Parameter) -> int:
+    """Over how many numbers one output of a reduction's or upsampling's layer sums; 1 elsewhere."""
+    if parameter.ndim != 2 or "regressor" in name:
+        return 1
+    return parameter.shape[0] if name.endswith("encode_matrix") else parameter.shape[1]
+
+
+def _measured(objective: Objective, losses: Tensor, weights: Tensor) -> dict[str, float]:
+    """Total, approximation, reconstruction of the training samples, and of the validation samples if there are any."""
     if torch.distributed.is_initialized():
         torch.distributed.all_reduce(losses)
         losses = losses / torch.distributed.get_world_size()
     with torch.no_grad():
         validation = objective.validation()
-    parts = [losses] + ([] if validation is None else [validation])
-    numbers = torch.stack([torch.cat([(p * weights).sum()[None], p]) for p in parts]).tolist()
-    return (*numbers[0], *(numbers[1] if len(numbers) > 1 else (math.nan,) * 3))
+    parts = [losses] if validation is None else [losses, validation]
+    numbers = torch.cat([torch.cat([(p * weights).sum()[None], p]) for p in parts]).tolist()
+    return dict(zip(HISTORY, numbers, strict=False))
 
 
 def _distributed(objective: Objective) -> nn.Module:
@@ -325,7 +338,8 @@ def _told(name: str, epochs: int, out: Fit) -> Epoch:
     last = {key: values[-1] for key, values in out.history.items()}
     done = out.epochs
     return Epoch(
-        name, done, epochs, last["total"], last["approximation"], last["reconstruction"], last["validation_total"],
+        name, done, epochs, last["total"], last["approximation"], last["reconstruction"],
+        last.get("validation_total", math.nan),
         out.best_epoch, last["learning_rate"], done / out.seconds, out.seconds / done * (epochs - done),
     )  # fmt: skip
 
