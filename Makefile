@@ -6,7 +6,7 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 DEMO   ?= demo
 
-.PHONY: demo test check docs benchmarks clean
+.PHONY: demo test check docs clean
 
 demo: $(READY)
 	$(BIN)/crashkit demo -o $(DEMO)
@@ -25,6 +25,9 @@ $(READY): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	touch $@
+
+docs: $(READY)
+	$(BIN)/mkdocs build --quiet --strict
 
 clean:
 	rm -rf $(VENV) $(DEMO) site
