@@ -44,6 +44,8 @@ class LevelSettings(_Frozen):
     channels       of gcn, behind the three coordinates
     order          Chebyshev terms
     hidden         of ae: widths between state and latent vector
+    regression     network: the MLP; process: a Gaussian process over whole runs, fitted to the encoded training states;
+                   mean of both; auto: what is best on validation runs. Levels trained together have the MLP alone
     rate_inputs    0, or: layers that sum over more numbers than this learn slower, in proportion
     start          pod: reduction gcn or ae beside a trainable linear part that starts at POD, its own end at zero
     """
@@ -56,6 +58,7 @@ class LevelSettings(_Frozen):
     hidden: tuple[Positive, ...] = (200, 80)
     start: Literal["plain", "pod"] = "plain"
     mlp: MlpSettings = MlpSettings()
+    regression: Literal["network", "process", "mean", "auto"] = "network"
 
     epochs: Positive = 1500
     batch: Positive = 32

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from surrogates.errors import SurrogateError
 from surrogates.network import take_over
 from surrogates.networks import Regressor
+from surrogates.process import LatentProcess
 from surrogates.reduction import LinearReduction, Reduction
 from surrogates.upsampling import Upsampling
 
@@ -48,6 +49,7 @@ class Level(nn.Module):
     upsampling  Up, in the coarse level's unit
     in_finer    (coarse node,) places of the coarse nodes among this level's: D
     with_initial  the encoded first state z0 is a further input of the regression
+    process     a Gaussian process whose answer is mixed into that of mlp*, once the level is trained
     """
 
     in_finer: Tensor
@@ -77,6 +79,7 @@ class Level(nn.Module):
         self.concat = concat
         self.with_initial = with_initial
         self.upsampling = upsampling
+        self.process: LatentProcess | None = None
         self.coarse: Level | None = coarse
         if coarse is not None and in_finer is not None:
             coarse.requires_grad_(False)
@@ -119,9 +122,11 @@ class Level(nn.Module):
                 below = known.regressed
             else:
                 below = self.coarse.regress(inputs, None, None if initial is None else self.restrict(initial))
+        known_inputs = inputs
         if self.with_initial:
             inputs = torch.cat([inputs, self.encoded_initial(inputs, initial)], dim=1)
-        return self.regressor(inputs, below)
+        z = self.regressor(inputs, below)
+        return z if self.process is None else torch.lerp(z, self.process(known_inputs), self.process.share)
 
     def encoded_initial(self, inputs: Tensor, initial: Tensor | None) -> Tensor:
         """z0 (b, latent): the encoded first state of each sample's run."""
@@ -138,10 +143,13 @@ class Level(nn.Module):
 
     def load_own_state(self, tensors: dict[str, Tensor]) -> None:
         """Take over what `own_state` gave; raises SurrogateError naming what does not fit."""
+        process = {k.removeprefix("process."): v for k, v in tensors.items() if k.startswith("process.")}
+        if process:
+            self.process = LatentProcess.like(process)
         take_over(self.own_state(), tensors)
 
     def parameter_counts(self) -> dict[str, int]:
-        """Numbers that make up this level without the coarser ones: "reduction", "regression", "upsampling".
+        """Numbers that make up this level without the coarser ones: "reduction", "regression", "upsampling", "process".
 
         A linear reduction that is computed, not trained, counts its modes (table 1 of the paper does).
         """
@@ -154,6 +162,7 @@ class Level(nn.Module):
             "reduction": reduction,
             "regression": _numbers(self.regressor),
             "upsampling": _numbers(self.upsampling) if moves and self.upsampling is not None else 0,
+            "process": 0 if self.process is None else sum(b.numel() for b in self.process.buffers()),
         }
 
 

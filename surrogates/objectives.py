@@ -78,6 +78,19 @@ class LevelObjective(Objective):
     def validation(self) -> Tensor | None:
         return _averaged(self._losses, self.validation_samples)
 
+    def latents(self) -> tuple[Tensor, Tensor]:
+        """Inputs (sample, ..) and encoded states (sample, latent) of the training runs."""
+        samples = self.training_samples
+        batches = (samples.batch(index) for index in samples.chunks())
+        return samples.inputs, torch.cat([self.level.encode(x, known) for x, _, known, _ in batches])
+
+    def latent_sizes(self) -> Tensor:
+        """(latent,) RMS movement of the nodes for a latent number that moves by one, about the mean latent vector."""
+        z = self.latents()[1]
+        middle, spread = z.mean(dim=0), z.std(dim=0).clamp_min(1e-6)
+        moved = self.level.decode(torch.cat([middle[None], middle + torch.diag(spread)]))
+        return (moved[:, 1:] - moved[:, :1]).square().mean(dim=(0, 2)).sqrt() / spread
+
     def _losses(self, samples: Samples, index: Tensor) -> Tensor:
         x, inputs, known, initial = samples.batch(index)
         z = torch.cat([self.level.regress(inputs, known, initial), self.level.encode(x, known)])
@@ -113,6 +126,14 @@ class LatentObjective(Objective):
 
     def validation(self) -> Tensor | None:
         return _averaged(lambda s, k: self._losses(s, k, self.validation_rest), self.validation_samples)
+
+    def latents(self) -> tuple[Tensor, Tensor]:
+        """As in `LevelObjective`."""
+        return self.training_samples.inputs, self.training_samples.states[:, 0]
+
+    def latent_sizes(self) -> Tensor:
+        """As in `LevelObjective`."""
+        return self.weight.sqrt()
 
     def _losses(self, samples: Samples, index: Tensor, rest: Tensor) -> Tensor:
         known = Known()

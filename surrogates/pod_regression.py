@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
@@ -21,6 +21,9 @@ from surrogates.data import Campaign
 from surrogates.errors import SurrogateError
 from surrogates.pod import Pod, pod
 from surrogates.samples import Notes, Runs, Split, scale_of
+
+if TYPE_CHECKING:
+    from sklearn.gaussian_process.kernels import Kernel
 
 Inputs = Literal["trajectory", "point"]
 # Samples that set the kernel's lengths; more only cost time.
@@ -74,9 +77,13 @@ class Gaussian:
 
         if not self._informed:
             return np.zeros((len(x), len(self.x)))
-        kernel = _kernel(self.x.shape[1]).clone_with_theta(self.theta)
+        kernel = self.kernel()
         factor = cho_factor(kernel(self.x) + 1e-10 * np.eye(len(self.x)), lower=True)
         return cho_solve(factor, kernel(x, self.x).T).T
+
+    def kernel(self) -> Kernel:
+        """The fitted kernel, noise included."""
+        return _kernel(self.x.shape[1]).clone_with_theta(self.theta)
 
     @property
     def _informed(self) -> bool:
@@ -297,7 +304,7 @@ def _errors(
     return (total / len(chosen)).tolist()
 
 
-def _kernel(inputs: int):  # type: ignore[no-untyped-def]
+def _kernel(inputs: int) -> Kernel:
     from sklearn.gaussian_process.kernels import ConstantKernel, DotProduct, Matern, WhiteKernel
 
     return (

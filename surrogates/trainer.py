@@ -18,6 +18,7 @@ from surrogates.inputs import InputScaling
 from surrogates.level import Level
 from surrogates.model import Surrogate, level_name
 from surrogates.objectives import CHUNK, LatentObjective, LevelObjective, Samples, UnifiedObjective, as_states
+from surrogates.process import mix_in
 from surrogates.reduction import LinearReduction, LinearStart, linear_part
 from surrogates.samples import Notes, Runs, Split, scale_of
 from surrogates.starts import pod_start, start_level, start_unified
@@ -48,7 +49,10 @@ class Trainer:
         make = self._on_coefficients if fixed else self._on_states
         objective = make(level, runs, inputs, held_inputs)
         cascade.add(number, level)
-        return self._fit(objective, number, level_name(self.settings, number), seed)
+        fitted = self._fit(objective, number, level_name(self.settings, number), seed)
+        wish = self.settings.for_level(number).regression
+        mix_in(level, objective, wish, self.campaign.parameters.shape[1], len(self.campaign.time), seed)
+        return fitted
 
     def unified(self, surrogate: Surrogate, numbers: tuple[int, ...], scaling: InputScaling) -> Fit:
         """Train levels `numbers` together, and put them on `surrogate`."""
@@ -91,7 +95,7 @@ class Trainer:
             report=self.report, keeper=self.keeper,
         )  # fmt: skip
 
-    def _on_states(self, level: Level, runs: Runs, inputs: Tensor, held_inputs: Tensor) -> Objective:
+    def _on_states(self, level: Level, runs: Runs, inputs: Tensor, held_inputs: Tensor) -> LevelObjective:
         states, held = (runs.samples(part) for part in self._parts)
         level.scale = _divide_by_rms(states, held)
         linear = linear_part(level.reduction)
@@ -102,7 +106,7 @@ class Trainer:
         validation = self._samples(level, held, held_inputs, len(self.split.validation)) if len(held) else None
         return LevelObjective(level, training, validation)
 
-    def _on_coefficients(self, level: Level, runs: Runs, inputs: Tensor, held_inputs: Tensor) -> Objective:
+    def _on_coefficients(self, level: Level, runs: Runs, inputs: Tensor, held_inputs: Tensor) -> LatentObjective:
         """POD on fields that stay where they are but for one run; training then sees coefficients alone."""
         squares: list[float] = []
 

@@ -1,0 +1,183 @@
+"""A Gaussian process from parameters to whole courses of latent vectors, to stand beside the network's regression.
+
+Runs are the samples and one kernel serves all outputs, so a prediction is a weighted sum of the training runs' courses;
+between trained states these are cubic. On few runs it errs differently from a network, and their mean is better than
+either. In torch, hence differentiable by the parameters and exportable.
+Source of the kernel's numbers: `surrogates.pod_regression.Gaussian` (Rasmussen and Williams 2006, equation 5.8).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Literal, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from surrogates.pod_regression import Gaussian
+
+if TYPE_CHECKING:
+    from sklearn.gaussian_process.kernels import Kernel
+
+Wish = Literal["network", "process", "mean", "auto"]
+# Shares of the process to choose from; without validation runs the first one is taken.
+_SHARES: Mapping[str, tuple[float, ...]] = {"process": (1.0,), "mean": (0.5,), "auto": (0.5, 0.0, 1.0)}
+
+
+class LatentProcess(nn.Module):
+    """Scaled inputs (b, parameter + 1, ..) -> z (b, latent); what stands behind the time is not read.
+
+    share     of the process in the level's regression; the rest is the network's
+    runs      (run, parameter) scaled parameters of the training runs
+    time      (state,) scaled, increasing
+    mean      (state, latent) mean course, and `pull` (run, state, latent) what each run adds to it
+    numbers   variance, variance of the linear trend, its offset, then one length for each parameter
+    """
+
+    runs: Tensor
+    time: Tensor
+    mean: Tensor
+    pull: Tensor
+    numbers: Tensor
+    share: Tensor
+
+    def __init__(self, runs: int, parameters: int, states: int, latent: int) -> None:
+        super().__init__()
+        for name, shape in (
+            ("runs", (runs, parameters)),
+            ("time", (states,)),
+            ("mean", (states, latent)),
+            ("pull", (runs, states, latent)),
+            ("numbers", (3 + parameters,)),
+            ("share", ()),
+        ):
+            self.register_buffer(name, torch.zeros(shape))
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        weights = self._kernel(inputs[:, : self.runs.shape[1]])
+        place, parts = self._stencil(inputs[:, self.runs.shape[1]])
+        out = torch.zeros_like(self.mean[:1])
+        for k, part in enumerate(parts):
+            at = (place + (k - 1)).clamp(0, len(self.time) - 1)
+            out = out + part[:, None] * (self.mean[at] + torch.einsum("br,rbz->bz", weights, self.pull[:, at]))
+        return out
+
+    def _kernel(self, x: Tensor) -> Tensor:
+        """(b, run): Matern 3/2 with a linear trend."""
+        variance, slope, offset, lengths = *self.numbers[:3], self.numbers[3:]
+        apart = ((x[:, None] - self.runs) / lengths).square().sum(dim=2)
+        distance = math.sqrt(3.0) * torch.sqrt(apart + 1e-12)
+        return variance * (1.0 + distance) * torch.exp(-distance) + slope * (offset.square() + x @ self.runs.T)
+
+    def _stencil(self, time: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor, Tensor]]:
+        """Interval (b,) of each time, and the weights (b,) of the states -1, 0, 1, 2 from its start.
+
+        Cubic Hermite pieces with slopes from the neighbouring states, one-sided at the ends; held outside.
+        """
+        last = len(self.time) - 1
+        if last == 0:
+            zero, one = torch.zeros_like(time), torch.ones_like(time)
+            return torch.zeros_like(time, dtype=torch.int64), (zero, one, zero, zero)
+        time = time.clamp(self.time[0], self.time[-1])
+        place = (time[:, None] >= self.time[1:-1]).sum(dim=1)
+        before, start, end, after = (self.time[(place + k).clamp(0, last)] for k in (-1, 0, 1, 2))
+        step = end - start
+        s = (time - start) / step
+        slope_start = step * s * (1 - s) ** 2
+        slope_end = step * s**2 * (s - 1)
+        left, right = slope_start / (end - before), slope_end / (after - start)
+        rise = s**2 * (3 - 2 * s)
+        return place, (-left, 1 - rise - right, rise + left, right)
+
+    @classmethod
+    def like(cls, tensors: Mapping[str, Tensor]) -> LatentProcess:
+        """An empty one with room for stored `tensors`."""
+        runs, states, latent = tensors["pull"].shape
+        return cls(runs, tensors["runs"].shape[1], states, latent)
+
+
+def fit_process(
+    runs: NDArray[np.float64],
+    time: NDArray[np.float64],
+    courses: NDArray[np.float64],
+    sizes: NDArray[np.float64],
+    seed: int,
+) -> LatentProcess:
+    """A process fitted to the courses (run, state, latent) of training runs with scaled parameters (run, parameter).
+
+    time   (state,) scaled
+    sizes  (latent,) how far the displacements move with each latent number: what counts in the kernel's likelihood
+    """
+    mean = courses.mean(axis=0)
+    machine = Gaussian(runs).fit((courses * sizes).reshape(len(runs), -1), seed)
+    kernel = machine.kernel()
+    pull = np.linalg.solve(kernel(runs), (courses - mean).reshape(len(runs), -1)).reshape(courses.shape)
+    out = LatentProcess(len(runs), runs.shape[1], len(time), courses.shape[2])
+    named = {"runs": runs, "time": time, "mean": mean, "pull": pull, "numbers": _numbers(kernel)}
+    for name, values in named.items():
+        getattr(out, name).copy_(torch.from_numpy(np.asarray(values, np.float64)))
+    return out
+
+
+class HasProcess(Protocol):
+    """A level."""
+
+    process: LatentProcess | None
+
+
+class Judge(Protocol):
+    """The samples a level was trained on, and its losses on validation runs."""
+
+    def latents(self) -> tuple[Tensor, Tensor]:
+        """Inputs (sample, ..) and encoded states (sample, latent) of the training runs, run by run."""
+        ...
+
+    def latent_sizes(self) -> Tensor:
+        """(latent,) RMS movement of the nodes for a latent number that moves by one."""
+        ...
+
+    def validation(self) -> Tensor | None:
+        """Losses (2,): approximation and reconstruction."""
+        ...
+
+
+@torch.no_grad()
+def mix_in(level: HasProcess, judge: Judge, wish: Wish, parameters: int, states: int, seed: int) -> None:
+    """Give a trained level the process that `wish` asks for; "auto" takes the share that is best on validation runs.
+
+    Nothing happens with fewer than 3 training runs, or runs that agree in all parameters.
+    """
+    if wish == "network":
+        return
+    found = judge.latents()
+    device = found[0].device
+    inputs, z = (tensor.double().cpu().numpy() for tensor in found)
+    runs, time = inputs[::states, :parameters], inputs[:states, parameters]
+    if len(runs) < 3 or not np.ptp(runs, axis=0).any():
+        return
+    sizes = judge.latent_sizes().double().cpu().numpy()
+    process = fit_process(runs, time, z.reshape(len(runs), states, -1), sizes, seed)
+    level.process = process.to(device)
+    losses = {}
+    for share in _SHARES[wish]:
+        process.share.fill_(share)
+        measured = judge.validation()
+        losses[share] = 0.0 if measured is None else float(measured[0])
+    best = min(losses, key=lambda share: losses[share])
+    process.share.fill_(best)
+    if best == 0:
+        level.process = None
+
+
+def _numbers(kernel: Kernel) -> NDArray[np.float64]:
+    """variance, slope, offset, lengths of c Matern + s DotProduct + noise."""
+    values = {name: value for name, value in kernel.get_params().items() if not name.endswith("bounds")}
+    return np.concatenate(
+        [
+            [values["k1__k1__k1__constant_value"], values["k1__k2__k1__constant_value"], values["k1__k2__k2__sigma_0"]],
+            np.atleast_1d(values["k1__k1__k2__length_scale"]),
+        ]
+    )
