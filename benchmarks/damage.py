@@ -12,7 +12,7 @@ Sets that are incomplete as they are, are read with `allow_incomplete`, else not
     states lost `validate` calls the dataset good although states are missing: must be 0
     traceback   an exception that is no message for a user: must be 0
     crash       the process died: must be 0
-    hang        no answer within 30 s: must be 0
+    hang        no answer within a minute, and again none when asked a second time: must be 0
 
 Exit code 1 where one of the last four is not 0. The work is done in child processes, which live on from case to
 case and are started anew only after a crash or a hang.
@@ -35,7 +35,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-PATIENCE = 30.0
+PATIENCE = 60.0
 OUTCOMES = ("refused", "identical", "other value", "states lost", "traceback", "crash", "hang")
 FORBIDDEN = OUTCOMES[3:]
 MODES = ("cut", "bit")
@@ -188,8 +188,7 @@ class Child:
             late.set()
             process.kill()
 
-        # A child that has just been started imports everything first.
-        watchdog = threading.Timer(PATIENCE * 2, give_up)
+        watchdog = threading.Timer(PATIENCE, give_up)
         watchdog.start()
         try:
             with contextlib.suppress(BrokenPipeError):
@@ -214,7 +213,11 @@ def work(todo: queue.SimpleQueue[tuple[Case, dict[str, Any]]], done: list[tuple[
     with contextlib.suppress(queue.Empty):
         while True:
             case, question = todo.get_nowait()
-            done.append((case, child.ask(question)))
+            answer = child.ask(question)
+            if answer["outcome"] == "hang":  # or the machine was busy with something else
+                print(f"  {case.name} gave no answer in {PATIENCE:.0f} s; asked again", file=sys.stderr)
+                answer = child.ask(question)
+            done.append((case, answer))
             if len(done) % 100 == 0:
                 print(f"  {len(done)} cases done", file=sys.stderr)
     child.stop()
