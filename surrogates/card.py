@@ -48,12 +48,13 @@ def card(surrogate: Surrogate) -> str:
     if record.errors:
         lines += [
             "Mean distance between true and predicted nodes over nodes, states and validation runs, on each level's own",
-            "nodes. Validation runs chose the weights kept (or the number of modes), so test runs may be worse.",
+            "nodes unless lifted. Validation runs chose the weights kept (or the number of modes), so test runs may be worse.",
             "",
             *_table(("measured", "error (cm)"), [(k, f"{100 * v:.3f}") for k, v in record.errors.items()]),
         ]
     else:
         lines.append("None were held out, so there is no independent error here.")
+    lines += ["", *_bands(surrogate)]
     lines += ["", "## Data", "", f"- dataset checksum (SHA-256): `{record.checksum or 'not recorded'}`"]
     lines += [f"- {key}: {value}" for key, value in record.attributes.items()]
     lines += [
@@ -77,6 +78,28 @@ def card(surrogate: Surrogate) -> str:
         "",
     ]
     return "\n".join(lines)
+
+
+def _bands(surrogate: Surrogate) -> list[str]:
+    if not surrogate.bands:
+        return ["There is no band around predictions: that takes at least two validation runs."]
+    rows = []
+    for name, number in surrogate.level_names.items():
+        for (k, lifted), band in surrogate.bands.items():
+            if k == number:
+                width = band.half_width(0.9, band.time)
+                rows.append(
+                    (
+                        f"{name}{', lifted to the full mesh' if lifted else ''}",
+                        f"{100 * width.mean():.2f}",
+                        str(band.runs),
+                    )
+                )
+    return [
+        "Band that holds nine of ten true nodes around the predicted ones, calibrated on the validation runs:",
+        "",
+        *_table(("prediction", "mean half-width (cm)", "validation runs"), rows),
+    ]
 
 
 def _level_row(surrogate: Surrogate, name: str, number: int) -> tuple[str, ...]:

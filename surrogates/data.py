@@ -47,7 +47,8 @@ class Campaign:
     parameters      (sim, parameter) float64, in the units of `parameter_units`
     time            (state,) float64, s
     displacement    level index -> (sim, state, node of that level, 3) float32, m. Called with 0 for the full mesh
-                    only by models that work there (POD baselines, AENN, GAENN); the cascade asks for its levels.
+                    only by models that work there (POD baselines, AENN, GAENN); the cascade asks for its levels, and
+                    reads only validation runs of the full mesh, to judge lifted predictions.
                     Anything that gives one run when indexed will do, so the full field need not be in memory.
     full_edges      (e, 2) graph edges of level 0, for models that convolve there
     levels          coarse levels, level 1 first; may be empty for POD baselines

@@ -21,6 +21,7 @@ from surrogates.network import Network
 from surrogates.pod_regression import PodRegression
 from surrogates.samples import Split
 from surrogates.training import Fit
+from surrogates.uncertainty import Band
 
 # Samples predicted at once.
 _CHUNK = 512
@@ -95,6 +96,7 @@ class Surrogate:
     ) -> None:
         self.settings, self.record, self.graphs, self.core = settings, record, graphs, core
         self.points, self.faces = points, faces
+        self.bands: dict[tuple[int, bool], Band] = {}
 
     @property
     def level_names(self) -> dict[str, int]:
@@ -112,7 +114,7 @@ class Surrogate:
         Raises SurrogateError for a level it does not have, or parameters of the wrong number or not finite.
         """
         number = self.number(level)
-        values, times = self._checked(parameters, time)
+        values, times = self.checked(parameters, time)
         if isinstance(self.core, PodRegression):
             out = self.core.displacement(values, times, number)
         else:
@@ -149,9 +151,39 @@ class Surrogate:
             parts = [core.reconstruct(part.transpose(0, 1), number) for part in torch.from_numpy(x).split(_CHUNK)]
         return torch.cat([part.transpose(0, 1) for part in parts]).contiguous().numpy()
 
+    def band(
+        self, coverage: float = 0.9, time: ArrayLike | None = None, level: int | None = None, *, full: bool = False
+    ) -> NDArray[np.float32]:
+        """How far, m, the true node may lie from the predicted one: (state, node of `level` or of the full mesh).
+
+        The share `coverage` of nodes and states of a new run lies within it, as far as the validation runs tell; see
+        `surrogates.uncertainty`. Raises SurrogateError where no validation runs were held out.
+        """
+        number = self.number(level)
+        found = self.bands.get((number, full and number > 0))
+        if found is None:
+            raise SurrogateError(
+                f"there is no band for {level_name(self.settings, number)}: too few validation runs were held out; see the model card"
+            )
+        return found.half_width(
+            coverage, self.record.time if time is None else np.atleast_1d(np.asarray(time, np.float64))
+        )
+
+    def sensitivity(
+        self,
+        parameters: ArrayLike,
+        time: ArrayLike | None = None,
+        level: int | None = None,
+        nodes: ArrayLike | None = None,
+    ) -> NDArray[np.float32]:
+        """Derivatives by the parameters (state, node, 3, parameter); see `surrogates.uncertainty.sensitivity`."""
+        from surrogates.uncertainty import sensitivity
+
+        return sensitivity(self, parameters, time, level, nodes)
+
     def outside(self, parameters: ArrayLike, time: ArrayLike | None = None) -> list[str]:
         """One sentence for each parameter, and the time, beyond the trained range; empty inside."""
-        return self.record.ranges.outside(*self._checked(parameters, time))
+        return self.record.ranges.outside(*self.checked(parameters, time))
 
     def n_parameters(self, level: int | None = None) -> int:
         """Numbers behind a prediction on `level`, those of the coarser levels it rests on included."""
@@ -201,10 +233,8 @@ class Surrogate:
             raise SurrogateError(f"level {level} was asked for; this surrogate predicts on {has}")
         return level
 
-    def _checked(
-        self, parameters: ArrayLike, time: ArrayLike | None
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(batch, p) and (state,), finite and of the right number."""
+    def checked(self, parameters: ArrayLike, time: ArrayLike | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Parameters as (batch, p) and times (state,); raises SurrogateError unless finite and of the right number."""
         values = np.atleast_2d(np.asarray(parameters, np.float64))
         names = self.record.ranges.names
         if values.ndim != 2 or values.shape[1] != len(names):

@@ -3,6 +3,7 @@
     model.json             what it is; SHA-256 of every other file, and of itself
     level_3.safetensors .. weights of each level (pod.safetensors for POD regressions)
     graphs.safetensors     the levels' graphs and maps, and the full mesh, so that it lifts and draws without the data
+    bands.safetensors      how far predictions may be wrong, from the validation runs
     history.json           losses by epoch and level
     card.md                for people
 
@@ -39,6 +40,7 @@ from surrogates.inputs import InputScaling
 from surrogates.model import Record, Surrogate, record_as_dict, record_from_dict
 from surrogates.network import Network, take_over
 from surrogates.pod_regression import PodRegression
+from surrogates.uncertainty import Band
 from surrogates.unified import Unified
 
 FORMAT = 1
@@ -89,11 +91,14 @@ def load(folder: str | Path) -> Surrogate:
         record = record_from_dict(about["record"], {int(k): v for k, v in histories.items()})
         graphs, points, faces = _graphs(load_file(folder / "graphs.safetensors"))
         core = _core(folder, about, settings, record, graphs)
+        bands = _bands(load_file(folder / "bands.safetensors"), record)
     except ModelFolderError:
         raise
     except (SurrogateError, SafetensorError, KeyError, TypeError, ValueError, IndexError) as error:
         raise ModelFolderError(f"{folder}: does not hold together ({error}); train it again") from error
-    return Surrogate(settings, record, graphs, core, points, faces)
+    surrogate = Surrogate(settings, record, graphs, core, points, faces)
+    surrogate.bands = bands
+    return surrogate
 
 
 def _write(surrogate: Surrogate, folder: Path) -> None:
@@ -101,6 +106,7 @@ def _write(surrogate: Surrogate, folder: Path) -> None:
     for stem, tensors in core.tensors().items():
         save_file({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, folder / f"{stem}.safetensors")
     save_file(_graph_tensors(surrogate), folder / "graphs.safetensors")
+    save_file(_band_tensors(surrogate), folder / "bands.safetensors")
     histories = {str(k): {n: _plain(v) for n, v in f.history.items()} for k, f in record.fits.items()}
     (folder / "history.json").write_text(json.dumps(histories), encoding="utf-8")
     (folder / "card.md").write_text(card(surrogate), encoding="utf-8")
@@ -207,6 +213,26 @@ def _graphs(tensors: Mapping[str, Tensor]) -> tuple[Graphs, NDArray[np.float64] 
         )  # fmt: skip
         finer = len(kept)
     return Graphs(n_full, tuple(levels), a.get("edges")), a.get("points"), a.get("faces")
+
+
+def _band_tensors(surrogate: Surrogate) -> dict[str, Tensor]:
+    out: dict[str, Tensor] = {}
+    for (number, lifted), band in surrogate.bands.items():
+        arrays = {"node": band.node, "state": band.state, "factor": band.factor}
+        prefix = f"{number}.{'full' if lifted else 'own'}."
+        out |= {prefix + k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in arrays.items()}
+        out[prefix + "runs"] = torch.tensor([band.runs])
+    return out
+
+
+def _bands(tensors: Mapping[str, Tensor], record: Record) -> dict[tuple[int, bool], Band]:
+    out = {}
+    for key in tensors:
+        number, where, name = key.split(".")
+        if name == "runs":
+            parts = {n: tensors[f"{number}.{where}.{n}"].numpy() for n in ("node", "state", "factor")}
+            out[int(number), where == "full"] = Band(**parts, time=record.time, runs=int(tensors[key][0]))
+    return out
 
 
 @contextmanager

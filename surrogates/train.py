@@ -20,7 +20,11 @@ from surrogates.refinement import Refined
 from surrogates.samples import Notes, Runs, check, split
 from surrogates.trainer import Trainer
 from surrogates.training import Epoch, Fit, Keeper, device_of
+from surrogates.uncertainty import FEWEST_RUNS, calibrate
 from surrogates.unified import Unified
+
+# Bytes of one run on the full mesh up to which lifted predictions are judged.
+_LARGEST_RUN = 2 << 30
 
 
 def train(
@@ -76,7 +80,13 @@ def level_numbers(settings: Settings, graphs: Graphs) -> tuple[int, ...]:
 
 def _fit_regression(surrogate: Surrogate, trainer: Trainer) -> None:
     started = time.perf_counter()
-    core, _, choice = fit_pod_regression(trainer.campaign, trainer.settings, trainer.split, trainer.notes)
+    campaign, held = trainer.campaign, trainer.split.validation
+    core, judged, choice = fit_pod_regression(campaign, trainer.settings, trainer.split, trainer.notes)
+    if judged is not None:  # the band comes from the model that has not seen the validation runs
+        surrogate.core = judged
+        runs = trainer.runs(0, surrogate.graphs)
+        distances = [_distance(_predicted(surrogate, campaign, run, 0), runs.read(run)) for run in held]
+        _note(surrogate, next(iter(surrogate.level_names)), 0, distances, [])
     surrogate.core = core
     surrogate.record.fits[0] = Fit(seconds=time.perf_counter() - started)
     surrogate.record.choice = {"inputs": choice.inputs, "modes": choice.modes}
@@ -133,17 +143,49 @@ def _fit_cascade(surrogate: Surrogate, trainer: Trainer) -> None:
 
 
 def _judge(surrogate: Surrogate, trainer: Trainer) -> None:
-    """Note e2 (m) over the validation runs on each level's own nodes: of the prediction, and of reduction alone."""
+    """Note errors e2 (m) over the validation runs, and calibrate the bands on them: on own nodes, and lifted."""
     held = trainer.split.validation
-    for name, number in surrogate.level_names.items() if len(held) else ():
+    if not len(held):
+        trainer.notes.add("no runs were held out, so there is neither a validation error nor a band")
+        return
+    full = _full_field(trainer)
+    for name, number in surrogate.level_names.items():
         runs = trainer.runs(number, surrogate.graphs)
-        predicted, reduced = [], []
+        own, lifted, reduced = [], [], []
         for run in held:
             truth = runs.read(run)
-            predicted.append(_distance(_predicted(surrogate, trainer.campaign, run, number), truth).mean())
+            predicted = _predicted(surrogate, trainer.campaign, run, number)
+            own.append(_distance(predicted, truth))
             reduced.append(_distance(surrogate.reconstruct(truth, number), truth).mean())
-        surrogate.record.errors[name] = float(np.mean(predicted))
+            if full is not None and number > 0:
+                lifted.append(_distance(surrogate.lift(predicted, number), full.read(run)))
+        _note(surrogate, name, number, own, lifted)
         surrogate.record.errors[f"{name}, reduction alone"] = float(np.mean(reduced))
+
+
+def _note(
+    surrogate: Surrogate,
+    name: str,
+    number: int,
+    own: list[NDArray[np.float32]],
+    lifted: list[NDArray[np.float32]],
+) -> None:
+    """Errors and bands from distances (state, node), one array for each validation run."""
+    for distances, is_lifted in ((own, False), (lifted, True)):
+        if distances:
+            label = f"{name}, lifted to the full mesh" if is_lifted else name
+            surrogate.record.errors[label] = float(np.mean([d.mean() for d in distances]))
+        if len(distances) >= FEWEST_RUNS:
+            surrogate.bands[number, is_lifted] = calibrate(distances, surrogate.record.time)
+
+
+def _full_field(trainer: Trainer) -> Runs | None:
+    """The full mesh's displacements, of which the validation runs alone are read; None where one run is too large."""
+    campaign = trainer.campaign
+    if len(campaign.time) * campaign.n_nodes * 12 > _LARGEST_RUN:
+        trainer.notes.add("a run of the full mesh is too large to judge lifted predictions while training")
+        return None
+    return Runs(campaign, 0, trainer.settings, trainer.notes)
 
 
 def node_errors(surrogate: Surrogate, trainer: Trainer, number: int) -> NDArray[np.float64]:
