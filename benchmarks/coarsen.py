@@ -168,7 +168,7 @@ def skin(nodes: int) -> tuple[np.ndarray, np.ndarray]:
     base, steps = nodes, 0
     while base > 2300:
         base, steps = base // 4, steps + 1
-    chosen = select_quadric(surface(position, faces), [base], sweeps=0)[0]
+    chosen = select_quadric(surface(position, faces), [base], rounds=0)[0]
     own = np.full(len(position), -1)
     own[chosen.kept] = np.arange(base)
     position, faces = position[chosen.kept], own[chosen.faces]

@@ -24,87 +24,6 @@ def _evaluate(q: NDArray, x: float, y: float, z: float) -> float:
 
 
 @njit(cache=True)
-def _add_plane(q: NDArray, nx: float, ny: float, nz: float, d: float, w: float) -> None:
-    q[0] += w * nx * nx
-    q[1] += w * nx * ny
-    q[2] += w * nx * nz
-    q[3] += w * nx * d
-    q[4] += w * ny * ny
-    q[5] += w * ny * nz
-    q[6] += w * ny * d
-    q[7] += w * nz * nz
-    q[8] += w * nz * d
-    q[9] += w * d * d
-
-
-@njit(cache=True)
-def _add_point(q: NDArray, x: float, y: float, z: float, w: float) -> None:
-    """w |v - (x, y, z)|^2."""
-    q[0] += w
-    q[4] += w
-    q[7] += w
-    q[3] -= w * x
-    q[6] -= w * y
-    q[8] -= w * z
-    q[9] += w * (x * x + y * y + z * z)
-
-
-@njit(cache=True)
-def quadrics(
-    position: NDArray, faces: NDArray, edges: NDArray, edge_faces: NDArray, edge_face: NDArray, boundary: float, spread: float
-) -> NDArray:  # fmt: skip
-    """Ten numbers a vertex: planes of its faces, planes across its open or branching edges, its own place.
-
-    `edge_faces` counts the faces of an edge, `edge_face` names one of them. `boundary` and `spread` weigh the
-    second and third part against the first; each is area times squared distance.
-    """
-    n = len(position)
-    out = np.zeros((n, 10))
-    normal = np.zeros((len(faces), 3))
-    for f in range(len(faces)):
-        a, b, c = faces[f]
-        e1 = position[b] - position[a]
-        e2 = position[c] - position[a]
-        nx = e1[1] * e2[2] - e1[2] * e2[1]
-        ny = e1[2] * e2[0] - e1[0] * e2[2]
-        nz = e1[0] * e2[1] - e1[1] * e2[0]
-        length = np.sqrt(nx * nx + ny * ny + nz * nz)
-        if length <= 0:
-            continue
-        nx, ny, nz = nx / length, ny / length, nz / length
-        normal[f] = nx, ny, nz
-        d = -(nx * position[a, 0] + ny * position[a, 1] + nz * position[a, 2])
-        third = length / 6
-        for v in (a, b, c):
-            _add_plane(out[v], nx, ny, nz, d, third)
-            _add_point(out[v], position[v, 0], position[v, 1], position[v, 2], spread * third)
-    for e in range(len(edges)):
-        if edge_faces[e] == 2:
-            continue
-        i, j = edges[e]
-        t = position[j] - position[i]
-        length2 = t[0] * t[0] + t[1] * t[1] + t[2] * t[2]
-        if length2 <= 0:
-            continue
-        if edge_faces[e] == 0:  # a lone edge: its own line, so that both directions across it cost
-            _add_point(out[i], position[i, 0], position[i, 1], position[i, 2], spread * length2)
-            _add_point(out[j], position[j, 0], position[j, 1], position[j, 2], spread * length2)
-            continue
-        m = normal[edge_face[e]]
-        nx = t[1] * m[2] - t[2] * m[1]
-        ny = t[2] * m[0] - t[0] * m[2]
-        nz = t[0] * m[1] - t[1] * m[0]
-        length = np.sqrt(nx * nx + ny * ny + nz * nz)
-        if length <= 0:
-            continue
-        nx, ny, nz = nx / length, ny / length, nz / length
-        d = -(nx * position[i, 0] + ny * position[i, 1] + nz * position[i, 2])
-        _add_plane(out[i], nx, ny, nz, d, boundary * length2)
-        _add_plane(out[j], nx, ny, nz, d, boundary * length2)
-    return out
-
-
-@njit(cache=True)
 def _less(cost: NDArray, tie: NDArray, a: int, b: int) -> bool:
     if cost[a] != cost[b]:
         return cost[a] < cost[b]
@@ -279,7 +198,7 @@ def contract(
         face_head[v] = c
     half_head = np.full(n, _NONE, np.int32)
     half_next = np.full(2 * len(edges), _NONE, np.int32)
-    half_to = np.empty(2 * len(edges), np.int32)
+    half_to = np.empty(2 * len(edges), np.int64)
     for h in range(2 * len(edges) - 1, -1, -1):
         v = edges[h // 2, h % 2]
         half_to[h] = edges[h // 2, 1 - h % 2]
@@ -290,9 +209,9 @@ def contract(
     known = np.zeros(n, np.int32)
     shared = np.full(n, _NONE, np.int32)
     cost = np.full(n, np.inf)
-    target = np.full(n, _NONE, np.int32)
-    heap = np.arange(n).astype(np.int32)
-    where = np.arange(n).astype(np.int32)
+    target = np.full(n, _NONE, np.int64)
+    heap = np.arange(n)
+    where = np.arange(n)
     for v in range(n):
         if not locked[v]:
             cost[v], target[v] = _best(

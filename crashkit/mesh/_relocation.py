@@ -1,4 +1,4 @@
-"""Compiled local search: kept vertices move to neighbouring nodes where that makes the level lift better."""
+"""Compiled local searches: other kept nodes, and other diagonals, where that makes a level lift better."""
 
 from __future__ import annotations
 
@@ -134,77 +134,136 @@ def _region(p: int, coarse: Coarse) -> NDArray:
 
 
 @njit(cache=True)
-def _stirred(p: int, sweep: int, last_move: NDArray, coarse: Coarse) -> bool:
-    """Whether p or a neighbour moved since the sweep before; where nothing did, nothing better can be found now."""
-    if last_move[p] >= sweep:
+def _any_around(p: int, marked: NDArray, coarse: Coarse) -> bool:
+    """Whether p or a neighbour is marked."""
+    if marked[p]:
         return True
     for j in range(coarse.near_start[p], coarse.near_start[p + 1]):  # noqa: SIM110 - numba has no generators here
-        if last_move[coarse.near_list[j]] >= sweep:
+        if marked[coarse.near_list[j]]:
             return True
     return False
 
 
 @njit(cache=True)
-def relocate(finer: Finer, coarse: Coarse, chosen: NDArray, radius: float, sweeps: int) -> int:
-    """Move each coarse vertex to the finer node beside it that most lowers the summed lifting cost around it.
+def closest_cells_around(finer: Finer, coarse: Coarse, radius: float) -> tuple[NDArray, NDArray, NDArray]:
+    """For each finer node the closest cell around its vertex, the squared distance to it and the cost of lifting."""
+    cell, d2, cost = np.empty(len(finer.at), np.int64), np.empty(len(finer.at)), np.empty(len(finer.at))
+    for x in range(len(finer.at)):
+        cell[x], d2[x], cost[x] = _closest_around(x, -1, finer, coarse, radius)
+    return cell, d2, cost
 
-    chosen (k,): finer node of each coarse vertex; it and `coarse.at` are changed in place. A vertex only goes to nodes
-    of the same parts that no other vertex sits on. Returns the number of moves.
+
+@njit(cache=True)
+def relocate(
+    finer: Finer, coarse: Coarse, chosen: NDArray, stirred: NDArray, radius: float,
+    cell: NDArray, d2: NDArray, cost: NDArray,
+) -> NDArray:  # fmt: skip
+    """Move each coarse vertex to the finer node beside it that most lowers the summed squared lifting cost around it.
+
+    chosen (k,): finer node of each coarse vertex; it, `coarse.at` and the three arrays of `closest_cells_around` are
+    changed in place. A vertex only goes to nodes of the same parts that no other vertex sits on. Where nothing was
+    `stirred` (k,) at a vertex or its neighbours since the last time, nothing better can be found, and none is sought.
+    Returns which vertices moved (k,).
     """
     points, parts, at, cells, cell_part = finer.at, finer.parts, coarse.at, coarse.cells, coarse.cell_part
     taken = np.zeros(len(finer.at), np.bool_)
     taken[chosen] = True
-    cell = np.empty(len(finer.at), np.int64)
-    d2, cost = np.empty(len(finer.at)), np.empty(len(finer.at))
-    for x in range(len(finer.at)):
-        cell[x], d2[x], cost[x] = _closest_around(x, -1, finer, coarse, radius)
-    last_move = np.zeros(len(chosen), np.int64)
-    moves = 0
-    for sweep in range(sweeps):
-        moves_before = moves
-        for p in range(len(chosen)):
-            if not _stirred(p, sweep, last_move, coarse):
+    moved = np.zeros(len(chosen), np.bool_)
+    for p in range(len(chosen)):
+        if not _any_around(p, stirred, coarse):
+            continue
+        region = _region(p, coarse)
+        # Without p's own cells first: they are what moves.
+        for x in region:
+            if cell[x] >= 0 and _touches(cells, cell[x], p):
+                cell[x], d2[x], cost[x] = _closest_around(x, p, finer, coarse, radius)
+        here = chosen[p]
+        best, best_total = here, np.inf
+        for j in range(finer.near_start[here] - 1, finer.near_start[here + 1]):
+            candidate = here if j < finer.near_start[here] else finer.near_list[j]
+            if candidate != here and (taken[candidate] or finer.kind[candidate] != finer.kind[here]):
                 continue
-            region = _region(p, coarse)
-            # Without p's own cells first: they are what moves.
-            for x in region:
-                if cell[x] >= 0 and _touches(coarse.cells, cell[x], p):
-                    cell[x], d2[x], cost[x] = _closest_around(x, p, finer, coarse, radius)
-            here = chosen[p]
-            best, best_total = here, np.inf
-            for j in range(finer.near_start[here] - 1, finer.near_start[here + 1]):
-                candidate = here if j < finer.near_start[here] else finer.near_list[j]
-                if candidate != here and (taken[candidate] or finer.kind[candidate] != finer.kind[here]):
-                    continue
-                for k in range(3):
-                    at[p, k] = finer.at[candidate, k]
-                total = 0.0
-                for x in region:
-                    x_d2, x_cost = d2[x], cost[x]
-                    for n in range(coarse.cell_start[p], coarse.cell_start[p + 1]):
-                        c_d2, c_cost = _closer(
-                            points, parts, x, at, cells, cell_part, coarse.cell_list[n], x_d2, radius
-                        )
-                        if c_d2 < x_d2:
-                            x_d2, x_cost = c_d2, c_cost
-                    total += finer.weight[x] * x_cost * x_cost
-                    if total >= best_total:
-                        break
-                # Less by a hair is rounding; moving for it would make the result depend on it.
-                if total < best_total * (1.0 - 1e-9):
-                    best, best_total = candidate, total
             for k in range(3):
-                at[p, k] = finer.at[best, k]
+                at[p, k] = points[candidate, k]
+            total = 0.0
             for x in region:
+                x_d2, x_cost = d2[x], cost[x]
                 for n in range(coarse.cell_start[p], coarse.cell_start[p + 1]):
-                    c_d2, c_cost = _closer(points, parts, x, at, cells, cell_part, coarse.cell_list[n], d2[x], radius)
-                    if c_d2 < d2[x]:
-                        cell[x], d2[x], cost[x] = coarse.cell_list[n], c_d2, c_cost
-            if best != here:
-                taken[here], taken[best] = False, True
-                chosen[p] = best
-                last_move[p] = sweep + 1
-                moves += 1
-        if moves == moves_before:
-            break
-    return moves
+                    c_d2, c_cost = _closer(points, parts, x, at, cells, cell_part, coarse.cell_list[n], x_d2, radius)
+                    if c_d2 < x_d2:
+                        x_d2, x_cost = c_d2, c_cost
+                total += finer.weight[x] * x_cost * x_cost
+                if total >= best_total:
+                    break
+            # Less by a hair is rounding; moving for it would make the result depend on it.
+            if total < best_total * (1.0 - 1e-9):
+                best, best_total = candidate, total
+        for k in range(3):
+            at[p, k] = points[best, k]
+        for x in region:
+            for n in range(coarse.cell_start[p], coarse.cell_start[p + 1]):
+                c_d2, c_cost = _closer(points, parts, x, at, cells, cell_part, coarse.cell_list[n], d2[x], radius)
+                if c_d2 < d2[x]:
+                    cell[x], d2[x], cost[x] = coarse.cell_list[n], c_d2, c_cost
+        if best != here:
+            taken[here], taken[best] = False, True
+            chosen[p] = best
+            moved[p] = True
+    return moved
+
+
+@njit(cache=True)
+def flip_gains(
+    finer: Finer, coarse: Coarse, pairs: NDArray, corners: NDArray, stirred: NDArray, radius: float,
+    cell: NDArray, d2: NDArray, cost: NDArray,
+) -> NDArray:  # fmt: skip
+    """How much the summed squared lifting cost falls if the common edge of two triangles is turned, (q,).
+
+    pairs (q, 2): the two cells; corners (q, 4) = a, b, c, d with the cells a b c and b a d, which become a d c and
+    d b c. The last two rows of `coarse.cells` are room for these. Every flip is judged as if it were the only one.
+    Zero where nothing was `stirred` (k,) around; `cell`, `d2`, `cost` as from `closest_cells_around`.
+    """
+    points, parts, at, cells, cell_part = finer.at, finer.parts, coarse.at, coarse.cells, coarse.cell_part
+    new = len(cells) - 2
+    gains = np.zeros(len(pairs))
+    for q in range(len(pairs)):
+        a, b, c, d = corners[q]
+        if not (
+            _any_around(a, stirred, coarse)
+            or _any_around(b, stirred, coarse)
+            or _any_around(c, stirred, coarse)
+            or _any_around(d, stirred, coarse)
+        ):
+            continue
+        cells[new, 0], cells[new, 1], cells[new, 2] = a, d, c
+        cells[new + 1, 0], cells[new + 1, 1], cells[new + 1, 2] = d, b, c
+        cell_part[new] = cell_part[new + 1] = cell_part[pairs[q, 0]]
+        for corner in corners[q]:
+            for i in range(coarse.member_start[corner], coarse.member_start[corner + 1]):
+                x = coarse.member_list[i]
+                x_d2, x_cost = d2[x], cost[x]
+                if cell[x] in (pairs[q, 0], pairs[q, 1]):
+                    x_d2, x_cost = _closest_but(x, pairs[q, 0], pairs[q, 1], finer, coarse, radius)
+                for n in (new, new + 1):
+                    n_d2, n_cost = _closer(points, parts, x, at, cells, cell_part, n, x_d2, radius)
+                    if n_d2 < x_d2:
+                        x_d2, x_cost = n_d2, n_cost
+                gains[q] += finer.weight[x] * (cost[x] * cost[x] - x_cost * x_cost)
+    return gains
+
+
+@njit(cache=True)
+def _closest_but(x: int, one: int, two: int, finer: Finer, coarse: Coarse, radius: float) -> tuple[float, float]:
+    """Squared distance and cost of the closest cell around the vertex of x that is neither `one` nor `two`."""
+    best_d2, best_cost = np.inf, np.inf
+    own = finer.into[x]
+    for k in range(coarse.near_start[own] - 1, coarse.near_start[own + 1]):
+        v = own if k < coarse.near_start[own] else coarse.near_list[k]
+        for j in range(coarse.cell_start[v], coarse.cell_start[v + 1]):
+            c = coarse.cell_list[j]
+            if c in (one, two):
+                continue
+            d2, cost = _closer(finer.at, finer.parts, x, coarse.at, coarse.cells, coarse.cell_part, c, best_d2, radius)
+            if d2 < best_d2:
+                best_d2, best_cost = d2, cost
+    return best_d2, best_cost

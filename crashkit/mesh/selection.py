@@ -9,13 +9,18 @@ neighbour where that lowers a bound on the error of lifting (docs/mesh.md).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from crashkit.errors import MeshError
+from crashkit.mesh.quadric import vertex_quadrics
 from crashkit.mesh.surface import Surface, adjacency, unique_pairs
+
+if TYPE_CHECKING:
+    from crashkit.mesh import _relocation
 
 # Weights beside the area-weighted squared distances to the planes of the faces: planes across open and branching
 # edges, and the squared distance of a contracted node from the one that stands for it. Found on training runs.
@@ -25,7 +30,7 @@ SPREAD = 0.005
 FLIP = 10.0
 # Fields are taken to turn over on this share of the mesh's diagonal when kept nodes change places.
 CURVATURE = 0.2
-SWEEPS = 3
+ROUNDS = 3
 # Close pairs: how much farther apart along the graph than through space, and how many neighbours are looked at.
 _DETOUR = 4.0
 _NEIGHBOURS = 16
@@ -67,7 +72,7 @@ def select_quadric(
     boundary: float = BOUNDARY,
     spread: float = SPREAD,
     curvature: float = CURVATURE,
-    sweeps: int = SWEEPS,
+    rounds: int = ROUNDS,
 ) -> list[Selection]:
     """One selection for each of `counts` (decreasing), every one a subset of the one before.
 
@@ -83,12 +88,11 @@ def select_quadric(
     weight: NDArray[np.float64] = np.ones(len(nodes))
     selections = []
     for count in counts:
-        finer_at, finer_parts, finer_edges = state.at, state.parts, state.edges
+        finer = _Finer(state.at, state.parts, state.edges, weight)
         kept, into = _contract(state, count, pair_distance / _scale(mesh))
-        if sweeps:
-            kept, into = _relocate(
-                state, kept, into, finer_at, finer_parts, finer_edges, weight, mesh.n_parts, curvature, sweeps
-            )
+        # Where less than one triangle a node is left, tubes have become chains, and the search loses more than it gains.
+        if len(state.faces) >= count:
+            kept, into = _improve(state, kept, into, finer, mesh.n_parts, curvature, rounds)
         nodes, weight = nodes[kept], np.bincount(into, weight, minlength=count).astype(np.float64)
         chain = np.where(chain >= 0, into[chain], -1)
         selections.append(_selection(nodes, state, chain))
@@ -140,8 +144,6 @@ def _scale(mesh: Surface) -> float:
 
 def _start(mesh: Surface, base: Selection, boundary: float, spread: float) -> tuple[NDArray[np.int64], _State]:
     """Nodes of `base` sorted by place, and its mesh in that numbering: the order of the input is forgotten here."""
-    from crashkit.mesh import _contraction
-
     order = np.lexsort(mesh.position[base.kept].T[::-1])
     nodes = base.kept[order]
     new = np.full(mesh.n_nodes, -1, np.int32)
@@ -158,7 +160,7 @@ def _start(mesh: Surface, base: Selection, boundary: float, spread: float) -> tu
     at = (at - (at.max(axis=0) + at.min(axis=0)) / 2) / _scale(mesh)
     state = _State(
         at=at,
-        quadric=_contraction.quadrics(at, faces, edges, *_faces_of_edges(faces, edges), boundary, spread),
+        quadric=vertex_quadrics(at, faces, edges, *_faces_of_edges(faces, edges), boundary, spread),
         faces=faces,
         part=base.part[sorted_faces],
         edges=edges,
@@ -232,19 +234,127 @@ def _contract_once(
     return kept, new[into]
 
 
-def _relocate(
-    state: _State, kept: NDArray[np.int64], into: NDArray[np.int32], finer_at: NDArray[np.float64],
-    finer_parts: NDArray[np.uint64], finer_edges: NDArray[np.int32], weight: NDArray[np.float64], n_parts: int,
-    curvature: float, sweeps: int,
+@dataclass(frozen=True)
+class _Finer:
+    """The mesh a level was contracted from: positions, part sets, graph edges, nodes of level 0 each node stands for."""
+
+    at: NDArray[np.float64]
+    parts: NDArray[np.uint64]
+    edges: NDArray[np.int32]
+    weight: NDArray[np.float64]
+
+
+def _improve(
+    state: _State, kept: NDArray[np.int64], into: NDArray[np.int32], finer: _Finer, n_parts: int, curvature: float,
+    rounds: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:  # fmt: skip
-    """Let the kept vertices change places with nodes of the finer level beside them, see `_relocation.relocate`."""
+    """Turns of two local searches for a lower bound on the lifting error: other nodes, and other diagonals.
+
+    `kept` and `into` as `_contract` returns them; `state` and what is returned are the same after the search.
+    """
+    from crashkit.mesh import _relocation
+
+    graph = adjacency(len(finer.at), finer.edges)
+    chosen = kept.copy()
+    compiled = _relocation.Finer(
+        at=finer.at,
+        weight=finer.weight,
+        parts=finer.parts,
+        kind=np.unique(finer.parts, axis=0, return_inverse=True)[1].ravel(),
+        into=into.copy(),
+        near_start=graph.indptr,
+        near_list=graph.indices,
+    )
+    stirred = np.ones(len(kept), bool)
+    for _ in range(rounds):
+        coarse = _coarse(state, compiled.into, n_parts)
+        closest = _relocation.closest_cells_around(compiled, coarse, curvature)
+        moved = _relocation.relocate(compiled, coarse, chosen, stirred, curvature, *closest)
+        state.at = finer.at[chosen]
+        flipped = _flip(state, compiled, coarse, stirred | moved, curvature, closest)
+        compiled.into[chosen] = np.arange(len(chosen))
+        stirred = moved | flipped
+        if not stirred.any():
+            break
+    return chosen, compiled.into
+
+
+def _flip(
+    state: _State, finer: _relocation.Finer, coarse: _relocation.Coarse, stirred: NDArray[np.bool_], curvature: float,
+    closest: tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]],
+) -> NDArray[np.bool_]:  # fmt: skip
+    """Turn the common edge of two triangles of one part where that lowers the bound; returns the corners (k,) bool."""
+    from crashkit.mesh import _relocation
+
+    pairs, corners = _turnable(state)
+    # The coarse cells hold the triangles part by part; here they are in the order of `state.faces`.
+    place = np.empty(len(state.part), np.int64)
+    place[np.argsort(state.part, kind="stable")] = np.flatnonzero(coarse.cells[:, 2] >= 0)
+    room = coarse._replace(
+        cells=np.concatenate([coarse.cells, np.full((2, 3), -1)]), cell_part=np.concatenate([coarse.cell_part, [0, 0]])
+    )
+    gains = _relocation.flip_gains(finer, room, place[pairs], corners, stirred, curvature, *closest)
+    flipped = np.zeros(len(state.at), bool)
+    chosen = []
+    for k in np.argsort(-gains, kind="stable").tolist():
+        if gains[k] <= 0:
+            break
+        if not flipped[corners[k]].any():
+            flipped[corners[k]] = True
+            chosen.append(k)
+    a, b, c, d = corners[chosen].T
+    state.faces[pairs[chosen, 0]] = np.stack([a, d, c], axis=1)
+    state.faces[pairs[chosen, 1]] = np.stack([d, b, c], axis=1)
+    width = len(state.at)
+    keys = state.edges[:, 0].astype(np.int64) * width + state.edges[:, 1]
+    gone = np.isin(keys, np.minimum(a, b).astype(np.int64) * width + np.maximum(a, b))
+    state.edges = unique_pairs(np.concatenate([state.edges[~gone], np.stack([c, d], axis=1)]))
+    return flipped
+
+
+def _turnable(state: _State) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Pairs of triangles whose common edge may be turned, and their corners a, b, c, d (triangles a b c and b a d).
+
+    Both are of one part, no third triangle touches the edge, the new edge is not there yet, and the two new triangles
+    face the way the old ones do.
+    """
+    n = len(state.at)
+    sides = state.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+    keys = sides.min(axis=1) * n + sides.max(axis=1)
+    order = np.argsort(keys, kind="stable")
+    same = np.flatnonzero(np.diff(keys[order]) == 0)
+    # Edges of exactly two triangles: the next side has the same key, the ones around have not.
+    padded = np.concatenate([[-1], keys[order], [-1]])
+    two = same[(padded[same] != padded[same + 1]) & (padded[same + 3] != padded[same + 1])]
+    first, second = order[two], order[two + 1]
+    pairs = np.stack([first, second], axis=1) // 3
+    a, b = sides[first].T
+    c = state.faces[pairs[:, 0]].sum(axis=1) - a - b
+    d = state.faces[pairs[:, 1]].sum(axis=1) - a - b
+    existing = state.edges[:, 0].astype(np.int64) * n + state.edges[:, 1]
+    at = state.at
+    old = np.cross(at[b] - at[a], at[c] - at[a])
+    one, other = np.cross(at[d] - at[a], at[c] - at[a]), np.cross(at[b] - at[d], at[c] - at[d])
+    good = (
+        (state.part[pairs[:, 0]] == state.part[pairs[:, 1]])
+        & (c != d)
+        & ~np.isin(np.minimum(c, d) * n + np.maximum(c, d), existing)
+        & ((one * old).sum(axis=1) > 0)
+        & ((other * old).sum(axis=1) > 0)
+    )
+    return pairs[good], np.stack([a, b, c, d], axis=1)[good].astype(np.int32)
+
+
+def _coarse(state: _State, into: NDArray[np.int32], n_parts: int) -> _relocation.Coarse:
+    """The coarse mesh as the compiled searches want it."""
     from crashkit.mesh import _relocation
     from crashkit.mesh.probe import cells_of_nodes, coarse_cells
 
+    n = len(state.at)
     cells = coarse_cells(state.faces, state.part, state.edges, state.parts, n_parts)
-    cell_start, cell_list = cells_of_nodes(cells.nodes, len(kept))
-    graph, finer_graph = adjacency(len(kept), state.edges), adjacency(len(finer_at), finer_edges)
-    coarse = _relocation.Coarse(
+    cell_start, cell_list = cells_of_nodes(cells.nodes, n)
+    graph = adjacency(n, state.edges)
+    return _relocation.Coarse(
         at=state.at.copy(),
         cells=cells.nodes,
         cell_part=cells.part,
@@ -252,24 +362,9 @@ def _relocate(
         cell_list=cell_list,
         near_start=graph.indptr,
         near_list=graph.indices,
-        member_start=np.concatenate([[0], np.cumsum(np.bincount(into, minlength=len(kept)))]),
+        member_start=np.concatenate([[0], np.cumsum(np.bincount(into, minlength=n))]),
         member_list=np.argsort(into, kind="stable"),
     )
-    finer = _relocation.Finer(
-        at=finer_at,
-        weight=weight,
-        parts=finer_parts,
-        kind=np.unique(finer_parts, axis=0, return_inverse=True)[1].ravel(),
-        into=into,
-        near_start=finer_graph.indptr,
-        near_list=finer_graph.indices,
-    )
-    chosen = kept.copy()
-    _relocation.relocate(finer, coarse, chosen, curvature, sweeps)
-    state.at = coarse.at
-    into = into.copy()
-    into[chosen] = np.arange(len(chosen))
-    return chosen, into
 
 
 def _lone_vertices(state: _State) -> NDArray[np.int32]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -62,10 +63,12 @@ def zarr_path(tmp_path: Path) -> Path:
     return tmp_path / "crash.zarr"
 
 
-@pytest.mark.filterwarnings("ignore::UserWarning")  # zarr on texts and consolidated metadata, which xarray writes
 def write(dataset: xr.Dataset, path: Path) -> None:
+    """`dataset` on disk; with the consolidated metadata that xarray puts into Zarr stores, of which Zarr warns."""
     if path.suffix == ".zarr":
-        dataset.drop_encoding().assign_coords(sim=dataset["sim"].astype("O")).to_zarr(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            dataset.drop_encoding().assign_coords(sim=dataset["sim"].astype("O")).to_zarr(path)
     else:
         dataset.to_netcdf(path)
 

@@ -43,7 +43,7 @@ def test_the_kart_stays_in_one_piece_down_to_nineteen_nodes() -> None:
 def test_contraction_keeps_the_corners_of_a_plate_and_moving_on_stays_beside_them() -> None:
     position, faces = plate(21, 21)
     corners = [0, 20, 420, 440]
-    contracted, moved = (select_quadric(surface(position, faces), [24], sweeps=s)[0].kept for s in (0, 3))
+    contracted, moved = (select_quadric(surface(position, faces), [24], rounds=s)[0].kept for s in (0, 3))
     assert np.isin(corners, contracted).all()
     away = np.linalg.norm(position[corners][:, None] - position[moved], axis=-1).min(axis=1)
     assert away.max() <= 1.5 * 0.05
@@ -52,7 +52,7 @@ def test_contraction_keeps_the_corners_of_a_plate_and_moving_on_stays_beside_the
 def test_a_bent_plate_keeps_nodes_on_its_fold() -> None:
     position, faces = plate(21, 21)
     position[:, 2] = np.abs(position[:, 0] - 0.5)
-    kept = select_quadric(surface(position, faces), [24], sweeps=0)[0].kept
+    kept = select_quadric(surface(position, faces), [24], rounds=0)[0].kept
     on_fold = np.isclose(position[kept, 0], 0.5)
     assert on_fold.sum() >= 4
     assert {0.0, 1.0} <= set(position[kept][on_fold][:, 1].tolist())
