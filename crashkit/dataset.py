@@ -60,7 +60,9 @@ def open_dataset(path: str | Path, *, chunks: Literal["stored"] | Mapping[str, i
             + ("; it is damaged" if "displacement" in dataset.variables else "")
         )
     with reading(path):
-        return dataset.assign({n: _as_text(v) for n, v in dataset.variables.items() if v.dtype.kind in "OT"})
+        out = dataset.assign({n: _as_text(v) for n, v in dataset.variables.items() if v.dtype.kind in "OT"})
+    out.set_close(dataset.close)
+    return out
 
 
 @contextlib.contextmanager

@@ -69,7 +69,9 @@ class CrashBackend(BackendEntrypoint):
             opened = _the_run(path, run, reader_for(path, reader).runs(path, **options))
             dataset = dataset_of(opened, units, parts, exclude_parts, keep_rigid_walls)
         drop = [drop_variables] if isinstance(drop_variables, str) else list(drop_variables or ())
-        return dataset.drop_vars(drop, errors="ignore")
+        kept = dataset.drop_vars(drop, errors="ignore")
+        kept.set_close(dataset.close)
+        return kept
 
     def guess_can_open(self, filename_or_obj: Any) -> bool:
         """Never: solver files have no suffix to know them by, and looking into every file would slow xarray down."""

@@ -27,7 +27,7 @@ from crashkit.staging import BackgroundHashes, StagedRun, Staging, key_of
 from crashkit.store import check_output, recover
 from crashkit.structure import Structure
 from crashkit.survey import Choice, Found, Survey, described, survey
-from crashkit.transfer import Layout, transfer
+from crashkit.transfer import Layout, is_whole, transfer
 
 Progress = Callable[[int, int, str], None]
 
@@ -91,7 +91,9 @@ def ingest(
     on_error          "stop" at the first run that cannot be used, or "skip" it and say so in the summary
     allow_incomplete  take runs that were cut short; what is missing of them is NaN
     overwrite         replace runs that the dataset already holds; without, they must be unchanged
-    workers           processes on this machine; scheduler: address of a Dask scheduler to use instead
+    workers           processes on this machine (a script that asks for several needs the usual
+                      `if __name__ == "__main__":`); scheduler: address of a Dask scheduler to use instead, whose
+                      workers see the same files
     progress          called with (runs done, runs in all or 0, note)
 
     An existing dataset gets new runs appended at its own times, and loses its mesh hierarchy, which belongs to the
@@ -112,7 +114,7 @@ def ingest(
         fields=tuple(dict.fromkeys(fields)), allow_incomplete=allow_incomplete, names=names, reader=reader,
         reader_options=(("mesh", str(mesh)),) if mesh is not None else (),
     )  # fmt: skip
-    with Staging(output) as staging, _disk_errors(staging):
+    with Staging(output) as staging, _what_is_kept(staging):
         recover(staging.folder, output)
         job = _Job(
             staging=staging,
@@ -146,21 +148,26 @@ class _Job:
         with closing(BackgroundHashes(staging)) as hashes:
             fresh, unchanged = self._fresh(look, old, hashes)
             if not fresh:
-                return _nothing_new(staging.output, old, unchanged, look)
+                summary = _nothing_new(staging.output, old, unchanged, look)
+                staging.discard()
+                return summary
             layout = self._layout(look, fresh, old)
             for found in fresh:
                 for file in found.files:
                     hashes.ask(file)
             keys = {f.name: _key(f, layout) for f in fresh}
-            resumed = sum(self._is_staged(keys[f.name]) for f in fresh)
-            staged = self._transfer(fresh, keys, layout, look, execute)
+            staged = self._staged_before(fresh, keys)
+            resumed = len(staged)
+            self._transfer(fresh, keys, staged, layout, look, execute)
             fresh = [f for f in fresh if f.name in staged]
             if not fresh:
                 raise DataError(f"no run can be used ({look.reasons()})")
             self.tell(len(fresh), len(fresh), "putting the dataset together")
             names = publish(staging, layout, fresh, staged, old, hashes)
         if former is not None and former.has_hierarchy:
-            look.note("the mesh hierarchy was that of the former runs and is gone; make a new one with crashkit coarsen")
+            look.note(
+                "the mesh hierarchy was that of the former runs and is gone; make a new one with crashkit coarsen"
+            )
         before = set(former.names) if former else set()
         summary = IngestSummary(
             output=staging.output,
@@ -261,26 +268,38 @@ class _Job:
             one_shape=look.one_shape and (old is None or old.one_shape),
         )
 
-    def _is_staged(self, key: str) -> bool:
-        return key in self.staging.runs and self.staging.place(key).is_dir()
+    def _staged_before(self, fresh: list[Found], keys: Mapping[str, str]) -> dict[str, StagedRun]:
+        """The runs that an earlier start has read, by name; their values are looked at again."""
+        staging = self.staging
+        out: dict[str, StagedRun] = {}
+        for found in fresh:
+            staged = staging.runs.get(keys[found.name])
+            if staged is None:
+                continue
+            self.tell(len(out), len(fresh), f"{found.name} was read before")
+            if is_whole(staged, staging.place(staged.key)):
+                out[found.name] = staged
+        return out
 
     def _transfer(
-        self, fresh: list[Found], keys: Mapping[str, str], layout: Layout, look: Survey, execute: _Executor
-    ) -> dict[str, StagedRun]:
-        """Every run that is not staged yet, staged; runs that turn out to be unusable are refused."""
-        staging = self.staging
-        staged = {f.name: staging.runs[keys[f.name]] for f in fresh if self._is_staged(keys[f.name])}
+        self,
+        fresh: list[Found],
+        keys: Mapping[str, str],
+        staged: dict[str, StagedRun],
+        layout: Layout,
+        look: Survey,
+        execute: _Executor,
+    ) -> None:
+        """Read every run that is not staged yet and add it to `staged`; runs that are unusable are refused."""
         todo = [f for f in fresh if f.name not in staged]
-        self.tell(len(staged), len(fresh), f"{len(staged)} runs were read before" if staged else "")
-        jobs = [(found, keys[found.name], staging.place(keys[found.name])) for found in todo]
-        for done, outcome in execute(jobs, layout):
+        jobs = [(found, keys[found.name], self.staging.place(keys[found.name])) for found in todo]
+        for job, outcome in execute(jobs, layout):
             if isinstance(outcome, StagedRun):
-                staging.finish(outcome)
+                self.staging.finish(outcome)
                 staged[outcome.name] = outcome
             else:
-                look.refuse(todo[done].name, outcome, self.stop)
-            self.tell(len(staged), len(fresh), todo[done].name)
-        return staged
+                look.refuse(todo[job].name, outcome, self.stop)
+            self.tell(len(staged), len(fresh), todo[job].name)
 
 
 # --- who does the work -------------------------------------------------------------------------------------------
@@ -344,14 +363,21 @@ def _with_dask(jobs: _Jobs, layout: Layout, workers: int, scheduler: str | None)
 
 
 @contextmanager
-def _disk_errors(staging: Staging) -> Iterator[None]:
-    """A full disk and the like, told as what they are."""
+def _what_is_kept(staging: Staging) -> Iterator[None]:
+    """Failures that say what of the work is not lost; a full disk and the like told as what they are."""
+
+    def kept() -> str:
+        count = len(staging.runs)
+        told = f"{count} finished run{'s are' if count > 1 else ' is'} kept in {staging.folder.name}"
+        return f" ({told}; the same command goes on from there)" if count else ""
+
     try:
         yield
+    except CrashkitError as error:
+        raise type(error)(f"{error}{kept()}") from error
     except OSError as error:
-        kept = f"; {len(staging.runs)} finished runs are kept, start the same command again" if staging.runs else ""
         raise OutputError(
-            f"{error.filename or staging.output}: {error.strerror or error} while writing {staging.output}{kept}"
+            f"{error.filename or staging.output}: {error.strerror or error}, while writing {staging.output}{kept()}"
         ) from error
 
 

@@ -111,6 +111,23 @@ def transfer(found: Found, layout: Layout, key: str, place: Path) -> StagedRun:
     return StagedRun(key, found.name, digests, error)
 
 
+def is_whole(staged: StagedRun, place: Path) -> bool:
+    """Whether the arrays at `place` still are what was written; a power cut may have cost some of them."""
+    import zarr
+
+    try:
+        for name, digest in staged.digests.items():
+            array = zarr.open_array(str(place / name), mode="r")
+            length, step = array.shape[2], array.chunks[2]
+            found = (block_digest(np.asarray(array[0, :, k : k + step])) for k in range(0, length, step))
+            if array_digest(found) != digest:
+                return False
+        position = place / "reference_position"
+        return not position.is_dir() or bool(np.isfinite(zarr.open_array(str(position), mode="r")[...]).all())
+    except Exception:  # a damaged file raises whatever its codec does; the run is then read again
+        return False
+
+
 class _Transfer:
     """The work on one run."""
 
