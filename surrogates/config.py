@@ -85,11 +85,13 @@ class TransferSettings(_Frozen):
     upsampling  static: the barycentric U; sparse: only U's non-zeros train; linear: all of W x + b (equation 12)
     encoder     add: z = enc(D x) + enc*(x); concat: both side by side, so the latent vector grows
     mlp         input: the coarse output is a further input; residual: it is also added to the result
+    epochs      share of its epochs that a level trains for which starts from a coarser one
     """
 
     upsampling: Literal["static", "sparse", "linear"] = "linear"
     encoder: Literal["add", "concat"] = "add"
     mlp: Literal["input", "residual"] = "input"
+    epochs: Annotated[float, Field(gt=0, le=1)] = 1.0
 
 
 class InputSettings(_Frozen):
@@ -185,10 +187,16 @@ class Settings(_Frozen):
             raise ValueError("unified has one latent vector, so transfer.encoder=concat means nothing")
         return self
 
-    def for_level(self, number: int) -> LevelSettings:
-        """The settings of level `number`: those of `level`, and what `at` says of it."""
-        own = self.at.get(number)
-        return self.level if own is None else LevelSettings.model_validate(_merged(self.level.model_dump(), own))
+    def for_level(self, number: int, *, transferred: bool = False) -> LevelSettings:
+        """The settings of level `number`: those of `level`, and what `at` says of it.
+
+        Where it starts from a coarser one (`transferred`), `transfer.epochs` shortens its training, unless `at` says.
+        """
+        own = self.at.get(number, {})
+        out = LevelSettings.model_validate(_merged(self.level.model_dump(), own)) if own else self.level
+        if transferred and "epochs" not in own:
+            out = out.model_copy(update={"epochs": max(1, round(self.transfer.epochs * out.epochs))})
+        return out
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, as they go into JSON and YAML."""
@@ -206,15 +214,17 @@ _FAST: dict[str, Any] = {
         "learning_rate": 4e-3,
         "schedule": "one_cycle",
         "weight_decay": 1e-4,
+        "rate_inputs": 16,
+        "regression": "auto",
     },
-    "transfer": {"mlp": "residual"},
+    "transfer": {"upsampling": "sparse", "mlp": "residual", "epochs": 0.2},
 }
 _PAPER: dict[str, Any] = {"validation": {"measure": "paper"}}
 _PRESETS: Mapping[str, dict[str, Any]] = {"fast": _FAST, "paper": _PAPER}
 _OF_MODEL: Mapping[str, dict[str, Any]] = {
-    "podnn": {"level": {"reduction": "pod", "start": "plain", "latent": 4}, "levels": [0]},
-    "aenn": {"level": {"reduction": "ae", "start": "plain"}, "levels": [0]},
-    "gaenn": {"level": {"reduction": "gcn"}, "levels": [0]},
+    "podnn": {"level": {"reduction": "pod", "start": "plain", "latent": 4, "regression": "network"}, "levels": [0]},
+    "aenn": {"level": {"reduction": "ae", "start": "plain", "regression": "network"}, "levels": [0]},
+    "gaenn": {"level": {"reduction": "gcn", "regression": "network"}, "levels": [0]},
 }
 
 

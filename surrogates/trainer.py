@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from surrogates.cascade import Cascade, build_level
-from surrogates.config import Settings
+from surrogates.config import LevelSettings, Settings
 from surrogates.data import Campaign
 from surrogates.graphs import Graphs
 from surrogates.inputs import InputScaling
@@ -49,9 +49,9 @@ class Trainer:
         make = self._on_coefficients if fixed else self._on_states
         objective = make(level, runs, inputs, held_inputs)
         cascade.add(number, level)
-        fitted = self._fit(objective, number, level_name(self.settings, number), seed)
-        wish = self.settings.for_level(number).regression
-        mix_in(level, objective, wish, self.campaign.parameters.shape[1], len(self.campaign.time), seed)
+        own = self.settings.for_level(number, transferred=level.coarse is not None)
+        fitted = self._fit(objective, own, level_name(self.settings, number), seed)
+        mix_in(level, objective, own.regression, self.campaign.parameters.shape[1], len(self.campaign.time), seed)
         return fitted
 
     def unified(self, surrogate: Surrogate, numbers: tuple[int, ...], scaling: InputScaling) -> Fit:
@@ -72,7 +72,7 @@ class Trainer:
             for x, y, part in zip((states, held), (inputs, held_inputs), self._parts, strict=True)
         )
         objective = UnifiedObjective(network, training, validation)
-        return self._fit(objective, finest, "MH", seed)
+        return self._fit(objective, self.settings.for_level(finest), "MH", seed)
 
     def runs(self, number: int, graphs: Graphs) -> Runs:
         """The displacements of level `number` of `graphs`, which may hold fewer nodes than the hierarchy's level."""
@@ -89,9 +89,9 @@ class Trainer:
         set_up(seed, self.settings.precision)
         return seed
 
-    def _fit(self, objective: Objective, number: int, name: str, seed: int) -> Fit:
+    def _fit(self, objective: Objective, settings: LevelSettings, name: str, seed: int) -> Fit:
         return fit(
-            objective, self.settings.for_level(number), name=name, seed=seed, precision=self.settings.precision,
+            objective, settings, name=name, seed=seed, precision=self.settings.precision,
             report=self.report, keeper=self.keeper,
         )  # fmt: skip
 

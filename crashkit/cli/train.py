@@ -217,7 +217,7 @@ def command(
     """Train a surrogate and store it as a folder. Ctrl-C ends early and stores what there is."""
     given = list(settings or ())
     if epochs is not None:
-        given.append(f"level.epochs={epochs}")
+        given += [f"level.epochs={epochs}", "transfer.epochs=1"]
     if seed is not None:
         given.append(f"seed={seed}")
     with _progress(quiet=json) as report:

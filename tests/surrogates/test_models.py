@@ -19,7 +19,7 @@ from surrogates.storage import load, save
 from surrogates.train import train
 from surrogates.training import Epoch
 
-SHORT = ("level.epochs=4", "level.batch=16")
+SHORT = ("level.epochs=4", "transfer.epochs=1", "level.batch=16")
 
 
 def trained(model: str, *overrides: str, runs: int = 10, **more: object) -> Surrogate:

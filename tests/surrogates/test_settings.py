@@ -85,3 +85,10 @@ def test_a_broken_file_is_named(tmp_path: Path, content: str, message: str) -> N
 
 def test_defaults_of_the_class_are_the_papers() -> None:
     assert Settings().level == settings("mh", "paper").level
+
+
+def test_levels_that_start_from_a_coarser_one_train_for_a_share_of_the_epochs() -> None:
+    chosen = settings("mh", overrides=["level.epochs=50", "transfer.epochs=0.1", "at.1.epochs=7"])
+    assert chosen.for_level(3).epochs == 50
+    assert chosen.for_level(2, transferred=True).epochs == 5
+    assert chosen.for_level(1, transferred=True).epochs == 7

@@ -26,7 +26,7 @@ def crash(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_two_processes_have_the_losses_of_one(crash: Path, tmp_path: Path) -> None:
-    chosen = ["level.epochs=3", "level.batch=16"]
+    chosen = ["level.epochs=3", "transfer.epochs=1", "level.batch=16"]
     alone = crashkit.train(crash, tmp_path / "alone", "mh", overrides=chosen, test="8:10", device="cpu")
     command = [
         sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2", "-m", "crashkit",
