@@ -13,7 +13,7 @@ from surrogates.config import Settings
 from surrogates.graphs import Graphs
 from surrogates.inputs import InputScaling
 from surrogates.level import Level
-from surrogates.network import Network
+from surrogates.network import Network, in_metres
 from surrogates.networks import Regressor
 from surrogates.reduction import make_reduction
 from surrogates.upsampling import Upsampling
@@ -50,11 +50,11 @@ class Cascade(Network):
 
     def forward(self, parameters: Tensor, time: Tensor, number: int) -> Tensor:
         level = self.levels[number]
-        return level.decode(level.regress(self.inputs(parameters, time))) * level.scale
+        return in_metres(level.decode(level.regress(self.inputs(parameters, time))), level.scale)
 
     def reconstruct(self, x: Tensor, number: int) -> Tensor:
         level = self.levels[number]
-        return level.decode(level.encode(x / level.scale)) * level.scale
+        return in_metres(level.decode(level.encode(x / level.scale)), level.scale)
 
     def n_parameters(self, number: int) -> int:
         return sum(sum(v.parameter_counts().values()) for k, v in self.levels.items() if k >= number)

@@ -52,6 +52,11 @@ class Network(nn.Module):
         raise NotImplementedError
 
 
+def in_metres(states: Tensor, scale: float) -> Tensor:
+    """`states` times `scale`, in place where no gradient is wanted: a run of the full mesh is not held twice."""
+    return states * scale if torch.is_grad_enabled() else states.mul_(scale)
+
+
 def take_over(mine: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> None:
     """Copy `given` into the live tensors `mine`; raises SurrogateError naming one that is missing or of another shape."""
     for name in sorted(mine.keys() | given.keys()):

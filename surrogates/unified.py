@@ -14,7 +14,7 @@ from surrogates.config import Settings
 from surrogates.errors import SurrogateError
 from surrogates.graphs import Graphs
 from surrogates.inputs import InputScaling
-from surrogates.network import Network
+from surrogates.network import Network, in_metres
 from surrogates.networks import Regressor
 from surrogates.reduction import LinearReduction, Reduction, make_reduction
 from surrogates.upsampling import Upsampling
@@ -98,14 +98,14 @@ class Unified(Network):
         return x if number == self._numbers[-1] else x[self.places[number].to(x.device)]
 
     def forward(self, parameters: Tensor, time: Tensor, number: int) -> Tensor:
-        return self.decode_all(self.regress(self.inputs(parameters, time)), number)[number] * self.scale
+        return in_metres(self.decode_all(self.regress(self.inputs(parameters, time)), number)[number], self.scale)
 
     def reconstruct(self, x: Tensor, number: int) -> Tensor:
         """Encode and decode; a coarse state is lifted to the finest level by the static U first."""
         if number != self._numbers[-1]:
             up = self.to_finest[number].astype("float32")
             x = torch.from_numpy((up @ x.reshape(len(x), -1).numpy()).reshape(-1, *x.shape[1:]))
-        return self.decode_all(self.encode(x / self.scale), number)[number] * self.scale
+        return in_metres(self.decode_all(self.encode(x / self.scale), number)[number], self.scale)
 
     def n_parameters(self, number: int) -> int:
         needed = [k for k in self._numbers if k >= number]
