@@ -31,7 +31,13 @@ def _variables() -> str:
     return _table(
         ("name", "dimensions", "unit", "required", "meaning"),
         [
-            (f"`{v.name}`", " or ".join(", ".join(d) for d in v.dims), v.unit or "-", "yes" if v.required else "", v.meaning)
+            (
+                f"`{v.name}`",
+                " or ".join(", ".join(d) for d in v.dims),
+                v.unit or "-",
+                "yes" if v.required else "",
+                v.meaning,
+            )
             for v in VARIABLES.values()
         ],
     )
