@@ -107,12 +107,19 @@ def peak_error(distance: NDArray[np.float64]) -> Peak:
     return Peak(float(distance[state, node]), int(state), int(node))
 
 
+def group_means(distance: NDArray[np.float64], groups: Sequence[NDArray[np.integer]]) -> NDArray[np.float64]:
+    """(state, group) m: mean of `distance` (state, node) within each group of node numbers; NaN for an empty one."""
+    if not groups:
+        return np.empty((len(distance), 0))
+    return np.stack([mean_node_error(distance[:, nodes]) for nodes in groups], axis=1)
+
+
 def group_error(distance: NDArray[np.float64], groups: Sequence[NDArray[np.integer]]) -> NDArray[np.float64]:
     """(group,) m: mean over time of the mean node error within each group of node numbers (a part, a region).
 
     Every state counts the same, as in e2; a group that is empty or gone throughout gives NaN.
     """
-    return np.array([float(masked_mean(mean_node_error(distance[:, nodes]))) for nodes in groups], dtype=np.float64)
+    return masked_mean(group_means(distance, groups), axis=0)
 
 
 def lift(field: NDArray[np.floating], to_full: object) -> NDArray[np.float32]:

@@ -8,7 +8,6 @@ incremental form of the hierarchical approximate POD (Himpe, Leibner, Rave 2018,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from evaluation.errors import EvaluationError
 from evaluation.measures import gone, mean_node_error
+from evaluation.tally import state_blocks
 
 # Rows of the tall matrices handled at once: bounds what is held in float64 beside the basis.
 _BLOCK = 1 << 14
@@ -115,17 +115,13 @@ def projection_error(displacement: NDArray[np.floating], modes: NDArray[np.float
         raise EvaluationError(
             f"the modes have {modes.shape[0] // 3} nodes and the run {displacement.shape[1]}; expected the same"
         )
-    rest = np.array(held(displacement), dtype=np.float32).reshape(states, -1)
-    there = ~gone(displacement)
-    coefficients = rest @ modes
+    whole, there = held(displacement), ~gone(displacement)
     out = np.empty((modes.shape[1], states))
-    for r in range(modes.shape[1]):
-        rest -= np.outer(coefficients[:, r], modes[:, r])
-        distance = np.sqrt(np.square(rest.reshape(displacement.shape)).sum(axis=-1, dtype=np.float64))
-        out[r] = mean_node_error(np.where(there, distance, np.nan))
+    for block in state_blocks(*displacement.shape[:2]):
+        rest = np.array(whole[block], dtype=np.float32).reshape(block.stop - block.start, -1)
+        coefficients = rest @ modes
+        for r in range(modes.shape[1]):
+            rest -= np.outer(coefficients[:, r], modes[:, r])
+            distance = np.sqrt(np.square(rest.reshape(whole[block].shape)).sum(axis=-1, dtype=np.float64))
+            out[r, block] = mean_node_error(np.where(there[block], distance, np.nan))
     return out
-
-
-def floors(errors: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Mean over time and runs of `projection_error` of every test run: (mode,), m."""
-    return np.mean([np.nanmean(e, axis=1) for e in errors], axis=0)

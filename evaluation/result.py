@@ -18,9 +18,10 @@ from evaluation.pod import Pod, StreamedPod
 from evaluation.predictor import Model, Predictor
 from evaluation.reference import Reference
 from evaluation.regions import by_grid, by_part
-from evaluation.scoring import Groups, Key, RunScores, Scores, full_field, gather, mesh_of, score_run
+from evaluation.scoring import Key, RunScores, Scores, full_field, gather, mesh_of, score_run
 from evaluation.sensors import Sensors, choose_sensors
 from evaluation.streaming import over_runs
+from evaluation.tally import Groups
 from evaluation.timing import Timing, time_predictions
 
 if TYPE_CHECKING:

@@ -14,25 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.errors import EvaluationError
-from evaluation.measures import (
-    Peak,
-    group_error,
-    largest_node_error,
-    lift,
-    masked_mean,
-    mean_node_error,
-    node_distance,
-    peak_error,
-    quantile_node_error,
-    relative_error,
-)
+from evaluation.measures import Peak, lift, masked_mean, mean_node_error, node_distance
 from evaluation.pod import held, projection_error
 from evaluation.predictor import Mesh, Predictor
 from evaluation.reference import Reference
-from evaluation.sensors import Parted, Sensors, Watched, part_error, watch
+from evaluation.sensors import Parted, Sensors, Watched, joined, part_error, watch
+from evaluation.tally import Groups, Tally, state_blocks
 
 Key = tuple[int, int]  # number of the model, number of its predictor
-Groups = Mapping[str, Sequence[NDArray[np.integer]]]
 
 
 @dataclass(frozen=True)
@@ -96,7 +85,7 @@ def score_run(
     groups: Groups | None = None,
     sensors: Sensors | None = None,
 ) -> RunScores:
-    """Score every predictor on run number `run`. Memory: the run and a few fields of its size.
+    """Score every predictor on run number `run`. Memory: the run, and some of its states at a time.
 
     modes   level -> (3 * node of the level, mode) from training runs, for the projection floor
     groups  grouping -> node numbers of each group, such as {"part": reference.part_nodes()}
@@ -113,8 +102,7 @@ def score_run(
             f"run {reference.runs[run]} has no displacement that is a number, so there is no reference to compare "
             f"with; leave it out of the test runs or ingest it again"
         )
-    groups = groups or {}
-    still = node_distance(truth, np.zeros_like(truth))
+    groups = {**(groups or {}), _LEVELS: _level_nodes(reference)}
     scores: dict[Key, RunScore] = {}
     for key, predictor in predictors.items():
         try:
@@ -125,13 +113,23 @@ def score_run(
         level: projection_error(truth if level == 0 else truth[:, reference.level(level).kept], basis)
         for level, basis in (modes or {}).items()
     }
-    lifting = {
-        level.index: mean_node_error(node_distance(truth, lift(held(truth)[:, level.kept], level.to_full)))
-        for level in reference.levels
-    }
-    group_size = {name: group_error(still, nodes) for name, nodes in groups.items()}
-    watched = None if sensors is None else watch(reference, sensors, run, truth)
-    return RunScores(run, scores, mean_node_error(still), group_size, floor, lifting, watched)
+    return RunScores(
+        run,
+        scores,
+        *_sizes(reference, truth, groups),
+        floor,
+        _lifting(reference, truth),
+        None
+        if sensors is None
+        else joined([watch(reference, sensors, run, truth[s]) for s in state_blocks(*truth.shape[:2])]),
+    )
+
+
+_LEVELS = "level"  # the grouping by which errors on the nodes of every level are found
+
+
+def _level_nodes(reference: Reference) -> list[NDArray[np.int64]]:
+    return [np.arange(reference.n_nodes), *(level.kept for level in reference.levels)]
 
 
 def _score(
@@ -143,27 +141,56 @@ def _score(
     sensors: Sensors | None,
 ) -> RunScore:
     mesh = mesh_of(reference, predictor)
-    own = truth if mesh is None else truth[:, mesh.kept]
-    prediction = full_field(reference, predictor, predictor.predict(reference.parameters[run], reference.time))
     # A reduction is asked about whole states; what is gone there stays where it was.
-    again = node_distance(truth, full_field(reference, predictor, predictor.reconstruct(held(own))))
-    distance = node_distance(truth, prediction)
-    there = ~np.isnan(distance)
+    own = held(truth) if mesh is None else held(truth[:, mesh.kept])
+    asked, again = Tally(groups, reference.n_nodes), Tally({_LEVELS: groups[_LEVELS]}, reference.n_nodes)
+    parted, watched = [], []
+    for states in state_blocks(*truth.shape[:2]):
+        count = states.stop - states.start
+        field = predictor.predict(reference.parameters[run], reference.time[states])
+        prediction = full_field(reference, predictor, field, count)
+        asked.add(truth[states], prediction)
+        parted.append(part_error(reference, run, truth[states], prediction))
+        if sensors is not None:
+            watched.append(watch(reference, sensors, run, prediction))
+        again.add(truth[states], full_field(reference, predictor, predictor.reconstruct(own[states]), count))
     return RunScore(
-        e2=mean_node_error(distance),
-        reconstruction=mean_node_error(again),
-        q95=quantile_node_error(distance, 0.95),
-        largest=largest_node_error(distance),
-        on_level=_on_levels(reference, distance),
-        on_level_reconstruction=_on_levels(reference, again),
-        relative=relative_error(truth, distance),
-        peak=peak_error(distance),
-        node_sum=np.where(there, distance, 0).sum(axis=0),
-        node_count=there.sum(axis=0),
-        groups={name: group_error(distance, nodes) for name, nodes in groups.items()},
-        parted=part_error(reference, run, truth, prediction),
-        watched=None if sensors is None else watch(reference, sensors, run, prediction),
+        e2=asked.over_time("e2"),
+        reconstruction=again.over_time("e2"),
+        q95=asked.over_time("q95"),
+        largest=asked.over_time("largest"),
+        on_level=asked.of_groups(_LEVELS),
+        on_level_reconstruction=again.of_groups(_LEVELS),
+        relative=asked.relative,
+        peak=asked.peak,
+        node_sum=asked.node_sum,
+        node_count=asked.node_count,
+        groups={name: asked.of_groups(name) for name in groups if name != _LEVELS},
+        parted=joined(parted),
+        watched=joined(watched) if watched else None,
     )
+
+
+def _sizes(
+    reference: Reference, truth: NDArray[np.float32], groups: Groups
+) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
+    """Mean displacement (state,) of all nodes, and over time of each group (group,), m."""
+    still = Tally(groups, reference.n_nodes)
+    for states in state_blocks(*truth.shape[:2]):
+        still.add(truth[states], np.zeros_like(truth[states]))
+    return still.over_time("e2"), {name: still.of_groups(name) for name in groups if name != _LEVELS}
+
+
+def _lifting(reference: Reference, truth: NDArray[np.float32]) -> dict[int, NDArray[np.float64]]:
+    """Level -> (state,) error of lifting the truth itself from it, m."""
+    out = {}
+    for level in reference.levels:
+        kept = held(truth[:, level.kept])
+        blocks = state_blocks(*truth.shape[:2])
+        out[level.index] = np.concatenate(
+            [mean_node_error(node_distance(truth[s], lift(kept[s], level.to_full))) for s in blocks]
+        )
+    return out
 
 
 def full_field(
@@ -190,11 +217,6 @@ def mesh_of(reference: Reference, predictor: Predictor) -> Mesh | None:
     if predictor.level == 0:
         return None
     return predictor.mesh if predictor.mesh is not None else reference.level(predictor.level)
-
-
-def _on_levels(reference: Reference, distance: NDArray[np.float64]) -> NDArray[np.float64]:
-    nodes = [np.arange(reference.n_nodes), *(level.kept for level in reference.levels)]
-    return group_error(distance, nodes)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,6 @@ from evaluation.rigid import split_error
 
 AXES = {"x": 0, "y": 1, "z": 2}
 N_PROBES = 4
-# Bytes of float64 positions handled at once in the rigid fit, which makes several copies of them.
-_BUDGET = 96 << 20
 
 
 @dataclass(frozen=True)
@@ -55,6 +54,9 @@ class Parted:
     true_deformation: NDArray[np.float64]
 
 
+Piece = TypeVar("Piece", Watched, Parted)
+
+
 def choose_sensors(
     reference: Reference, probes: Sequence[int] | None = None, intrusion: tuple[str, str] | None = None
 ) -> Sensors:
@@ -91,32 +93,25 @@ def choose_sensors(
 
 
 def watch(reference: Reference, sensors: Sensors, run: int, field: NDArray[np.floating]) -> Watched:
-    """What `sensors` see of `field` (state, node, 3), m, in run number `run`; a few states at a time."""
-    position = reference.position_of(run)
-    history = [
-        intrusion(position, field[s], sensors.intruding, sensors.direction, sensors.watching).history
-        if np.isfinite(field[s][:, sensors.intruding]).any()
-        else np.full(len(field[s]), np.nan)
-        for s in _blocks(field)
-    ]
-    return Watched(field[:, sensors.probes].astype(np.float64), np.concatenate(history))
+    """What `sensors` see of `field` (state, node, 3), m, some states of run number `run`."""
+    if np.isfinite(field[:, sensors.intruding]).any():
+        position = reference.position_of(run)
+        seen = intrusion(position, field, sensors.intruding, sensors.direction, sensors.watching).history
+    else:
+        seen = np.full(len(field), np.nan)
+    return Watched(field[:, sensors.probes].astype(np.float64), seen)
 
 
 def part_error(reference: Reference, run: int, truth: NDArray[np.floating], prediction: NDArray[np.floating]) -> Parted:
-    """Errors of `prediction` by kind (evaluation.rigid.split_error), a few states at a time."""
-    position = reference.position_of(run)
-    pieces = [split_error(position, truth[s], prediction[s]) for s in _blocks(truth)]
-    return Parted(
-        *(
-            np.concatenate([getattr(p, name) for p in pieces])
-            for name in ("rigid", "deformation", "true_rigid", "true_deformation")
-        )
-    )
+    """Errors of `prediction` (state, node, 3) by kind, for some states of run number `run`."""
+    split = split_error(reference.position_of(run), truth, prediction)
+    return Parted(split.rigid, split.deformation, split.true_rigid, split.true_deformation)
 
 
-def _blocks(field: NDArray[np.floating]) -> list[slice]:
-    step = max(1, _BUDGET // (field.shape[1] * 24))
-    return [slice(k, k + step) for k in range(0, len(field), step)]
+def joined(pieces: Sequence[Piece]) -> Piece:
+    """Pieces of a run, one behind the other."""
+    kind = type(pieces[0])
+    return kind(*(np.concatenate([getattr(piece, f.name) for piece in pieces]) for f in fields(kind)))
 
 
 def _spread(position: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -389,8 +389,8 @@ def command(
     table(
         f"Mean node error of {len(result.runs)} test runs on the full mesh, cm",
         (
-            "model", "nodes", "error", *(["± seeds"] if several else []), "% of motion", "worst run", "reduction",
-            "POD floor", "train s", "ms/state",
+            "model", "nodes", "error", *(["± seeds"] if several else []), "% of motion", "worst run", "reduced",
+            "POD floor", "train s", "ms",
         ),
         (
             (

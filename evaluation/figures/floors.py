@@ -20,12 +20,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Point:
-    """One model: numbers a state is reduced to, and its errors on the full mesh, m."""
+    """One model: numbers a state is reduced to, and its errors on the full mesh, m; seeds (seed,) the total of each."""
 
     latent: int
     total: float
     reduction: float
     lifting: float
+    seeds: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -79,12 +80,15 @@ class Floors:
             colour = sheet.style(label).colour
             ax.barh(y, p.total * CM, height=0.62, color=colour, alpha=0.35)  # type: ignore[attr-defined]
             ax.barh(y, p.reduction * CM, height=0.62, color=colour)  # type: ignore[attr-defined]
+            if len(p.seeds) > 1:
+                ends = (min(p.seeds) * CM, max(p.seeds) * CM)
+                ax.plot(ends, [y, y], color=INK, linewidth=1.2, marker="|", markersize=7)  # type: ignore[attr-defined]
             if p.lifting:
                 ax.plot(  # type: ignore[attr-defined]
                     [p.lifting * CM] * 2, [y - 0.36, y + 0.36], color="black", linewidth=1.4
                 )
             ax.text(  # type: ignore[attr-defined]
-                max(p.total, p.reduction) * CM, y, f" {p.total * CM:.2f}", va="center", fontsize=8, color=INK
+                max(p.total, p.reduction, *p.seeds) * CM, y, f" {p.total * CM:.2f}", va="center", fontsize=8, color=INK
             )
         ax.set_yticks(at, labels)  # type: ignore[attr-defined]
         ax.grid(axis="y", visible=False)  # type: ignore[attr-defined]
@@ -101,6 +105,7 @@ class Floors:
             if need.size
             else f"no projection on up to {len(self.floor)} modes would be as exact"
         )
+        seeds = "; thin lines span the seeds" if any(len(q.seeds) > 1 for q in self.points.values()) else ""
         share = 100 * min(1.0, p.reduction / p.total)
         return (
             f"First: the line is what a linear reduction of the test runs costs before any regression; a model "
@@ -121,6 +126,7 @@ def select(evaluation: Evaluation) -> Floors | None:
             evaluation.scores[e.label].mean,
             evaluation.scores[e.label].reduction,
             evaluation.lifting(e.level),
+            tuple(float(s) for s in evaluation.scores[e.label].of_seeds),
         )
         for e in evaluation.entries
     }

@@ -9,8 +9,10 @@ import pytest
 
 from evaluation.comparison import Split
 from evaluation.errors import EvaluationError
+from evaluation.reference import Reference
 from evaluation.result import compare, decompose, predictors_of
 from evaluation.scoring import gather, score_run
+from evaluation.sensors import choose_sensors
 
 
 def test_the_number_in_the_table_is_the_mean_of_means(reference, models, evaluation):
@@ -147,3 +149,51 @@ def test_modes_of_each_level_come_from_one_pass(reference):
     assert {level: len(pod.modes) for level, pod in pods.items()} == {
         level: 3 * reference.level_nodes(level) for level in range(4)
     }
+
+
+def test_how_many_states_are_handled_at_once_does_not_matter(reference, models, evaluation, monkeypatch):
+    monkeypatch.setattr("evaluation.tally._BLOCK", 1)  # one state at a time
+    again = score_run(reference, predictors_of(models), 9, {0: evaluation.pods[0].modes}, sensors=evaluation.sensors)
+    before = evaluation.runs[0]
+    np.testing.assert_allclose(again.size, before.size, rtol=1e-6)
+    np.testing.assert_allclose(again.floor[0], before.floor[0], rtol=1e-4)
+    for key, score in again.scores.items():
+        np.testing.assert_allclose(score.e2, before.scores[key].e2, rtol=1e-5)
+        np.testing.assert_allclose(score.reconstruction, before.scores[key].reconstruction, rtol=1e-4)
+        np.testing.assert_allclose(score.on_level, before.scores[key].on_level, rtol=1e-5)
+        np.testing.assert_allclose(score.parted.deformation, before.scores[key].parted.deformation, atol=1e-6)
+        np.testing.assert_allclose(score.watched.intrusion, before.scores[key].watched.intrusion, atol=1e-6)
+        assert (score.peak.state, score.peak.node) == (before.scores[key].peak.state, before.scores[key].peak.node)
+        assert score.relative == pytest.approx(before.scores[key].relative, rel=1e-6)
+
+
+def test_scoring_holds_one_run_and_some_of_its_states(monkeypatch):
+    import tracemalloc
+
+    nodes, states = 4000, 60
+    u = np.zeros((states, nodes, 3), np.float32)
+    u[..., 0] = np.linspace(0, 1, states)[:, None]
+
+    class Still:
+        name, level, mesh, n_latent = "still", 0, None, 1
+
+        def predict(self, parameters, time):
+            return np.zeros((len(time), nodes, 3), np.float32)
+
+        def reconstruct(self, displacement):
+            return displacement
+
+    position = np.random.default_rng(0).uniform(size=(nodes, 3))
+    big = Reference(
+        runs=("a",), parameters=np.zeros((1, 1)), parameter_names=("p",), parameter_units=("1",),
+        time=np.linspace(0, 0.03, states), displacement=lambda k: u.copy(), position=position,
+        faces=np.array([[0, 1, 2]]), face_part=np.array([0]), part_names=("all",), node_id=np.arange(nodes),
+        part_id=np.array([1]),
+    )  # fmt: skip
+    monkeypatch.setattr("evaluation.tally._BLOCK", 12 * nodes)
+    sensors = choose_sensors(big)
+    tracemalloc.start()
+    score_run(big, {(0, 0): Still()}, 0, {0: np.eye(3 * nodes, 2, dtype=np.float32)}, sensors=sensors)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2 * u.nbytes
