@@ -263,6 +263,7 @@ def _show(surrogate: Surrogate, output: Path, as_json: bool) -> None:
             "best_epoch": record.fits[number].best_epoch,
             "seconds": round(record.fits[number].seconds, 2),
             "status": record.fits[number].status,
+            "validation_error_m": record.errors.get(name),
         }
         for name, number in surrogate.level_names.items()
     ]
@@ -280,9 +281,17 @@ def _show(surrogate: Surrogate, output: Path, as_json: bool) -> None:
     table(
         f"{output}: {len(record.fitted_runs)} training, {len(record.validation_runs)} validation, "
         f"{len(record.held_out_runs)} held-out runs",
-        ("model", "nodes", "parameters", "epochs", "best", "training (s)"),
+        ("model", "nodes", "parameters", "epochs", "best", "training (s)", "validation error (cm)"),
         (
-            (r["model"], r["nodes"], r["parameters"], r["epochs"] or "-", r["best_epoch"] or "-", f"{r['seconds']:.1f}")
+            (
+                r["model"],
+                r["nodes"],
+                r["parameters"],
+                r["epochs"] or "-",
+                r["best_epoch"] or "-",
+                f"{r['seconds']:.1f}",
+                "-" if r["validation_error_m"] is None else f"{100 * r['validation_error_m']:.2f}",
+            )
             for r in rows
         ),
     )
