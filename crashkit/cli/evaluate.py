@@ -111,6 +111,21 @@ def evaluate(
 _HELD: dict[str, tuple[Reference, tuple[Model, ...]]] = {}
 
 
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Sums in one order: how many threads share a product must not decide the last bits of a table."""
+    import torch
+    from threadpoolctl import threadpool_limits
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1):
+            yield
+    finally:
+        torch.set_num_threads(before)
+
+
 @dataclass(frozen=True)
 class ScoreJob:
     """Scoring one run, to be sent to another process: it opens the files there, once a process."""
@@ -132,7 +147,8 @@ class ScoreJob:
             _HELD[evaluation] = _opened(self.dataset, self.models)
         reference, models = _HELD[evaluation]
         modes = {level: np.load(path, mmap_mode="r", allow_pickle=False) for level, path in self.modes.items()}
-        return score_run(reference, predictors_of(models), run, modes, default_groups(reference)[0], self.sensors)
+        with _one_thread():
+            return score_run(reference, predictors_of(models), run, modes, default_groups(reference)[0], self.sensors)
 
 
 def _keep_modes(pods: Mapping[int, Any], folder: Path) -> dict[int, str]:

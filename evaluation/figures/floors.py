@@ -112,7 +112,7 @@ class Floors:
             f"above it "
             f"loses the rest to regression, a model below it reduces better than POD with as many numbers. Second: the "
             f"full bar is the error of encoding and decoding the truth, the pale bar the error of the prediction, the "
-            f"black mark what lifting from the coarse mesh costs even if all else were exact. For {best}, "
+            f"black mark what lifting from the coarse mesh costs even if all else were exact{seeds}. For {best}, "
             f"{modes}, and reduction makes {share:.0f} % of the size of its error."
         )
 

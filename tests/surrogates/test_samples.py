@@ -54,7 +54,7 @@ def test_paper_keeps_all_runs_for_training() -> None:
 def test_too_few_runs_are_told() -> None:
     notes = Notes()
     assert len(split(plate.campaign(2), settings("mh"), notes).validation) == 0
-    assert "too few to hold any out" in notes.lines[0]
+    assert "no run can be held out of 2" in notes.lines[0]
 
 
 def test_a_missing_value_is_named_by_run_state_and_node() -> None:
