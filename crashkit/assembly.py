@@ -157,7 +157,7 @@ def _small(
     """Coordinates, mesh, parameters and attributes: everything but the results."""
     import xarray as xr
 
-    s = layout.structure
+    s, fresh = layout.structure, next(iter(new.values()))
     rows = [
         _OfRun.kept(old, n) if old is not None and n not in new else _OfRun.new(new[n], staged[n], layout.time)
         for n in names
@@ -198,7 +198,8 @@ def _small(
         ds["cell_id"] = ("cell", s.cell_id, {"long_name": "the solver's element number"})
     if any(r.source_time is not None for r in rows):
         ds["source_time"] = (("sim", "source_state"), _padded(rows, layout.time), {"units": "s"})
-    for name, (_, unit) in next(iter(new.values())).parameters.items():
+    units = old.parameters if old is not None else {n: u for n, (_, u) in fresh.parameters.items()}
+    for name, unit in units.items():
         values = np.array([r.parameters[name] for r in rows], np.float64)
         ds[name] = ("sim", values, {"units": unit, "role": "parameter"})
     files = [e for e in old.files() if e["run"] in names and e["run"] not in new] if old is not None else []
@@ -214,7 +215,7 @@ def _small(
         "source_files": json.dumps(files),
         "units_read": _joined(past.get("units_read"), *(f.units for f in new.values())),
         "units_written": "SI",
-        "parameters": json.dumps(list(next(iter(new.values())).parameters)),
+        "parameters": json.dumps(list(units)),
         "crashkit_version": __version__,
         "history": "\n".join(filter(None, [past.get("history"), _history(tuple(new.values()), layout)])),
     }

@@ -27,7 +27,7 @@ from crashkit.staging import BackgroundHashes, StagedRun, Staging, key_of
 from crashkit.store import check_output, recover
 from crashkit.structure import Structure
 from crashkit.survey import Choice, Found, Survey, described, survey
-from crashkit.transfer import Layout, is_whole, transfer
+from crashkit.transfer import Layout, is_whole, let_memory_go, transfer
 
 Progress = Callable[[int, int, str], None]
 
@@ -125,7 +125,10 @@ def ingest(
             overwrite=overwrite,
             tell=progress or (lambda done, total, note: None),
         )
-        return job.run(paths, _executor(workers, scheduler))
+        try:
+            return job.run(paths, _executor(workers, scheduler))
+        finally:
+            let_memory_go()
 
 
 @dataclass
@@ -355,7 +358,14 @@ def _with_dask(jobs: _Jobs, layout: Layout, workers: int, scheduler: str | None)
                 for k, (found, key, place) in enumerate(jobs)
             }
             for future in as_completed(list(futures)):
-                yield futures[future], future.result()
+                job = futures[future]
+                try:
+                    outcome = future.result()
+                except (CrashkitError, OSError):
+                    raise
+                except Exception as error:  # Dask has several names for a worker that died
+                    raise CrashkitError(f"run {jobs[job][0].name}: its worker failed ({error})") from error
+                yield job, outcome
         finally:
             client.close()
             if cluster is not None:

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from crashkit.errors import ReadError
+from crashkit.readers._checks import reading
 from crashkit.readers.base import Run
 from crashkit.structure import Structure
 from crashkit.survey import Field, cell_fields
@@ -24,11 +26,15 @@ class RunView:
 
     def displacement(self, first: int, last: int) -> NDArray[np.float32]:
         """(state, node, 3), m, of the states first <= state < last; may be the reader's own, so not to be written to."""
-        return _scaled(_gather(self.run.displacement(first, last), self.structure.node), self.system.length)
+        with reading(f"run {self.run.name}, displacement of states {first} to {last - 1}"):
+            values = self.run.displacement(first, last)
+        self._expect(values, (last - first, len(self.run.mesh.position), 3), "displacement")
+        return _scaled(_gather(values, self.structure.node), self.system.length)
 
     def alive(self, first: int, last: int) -> tuple[Flags | None, Flags | None]:
         """(state, face) and (state, cell), None where the run does not say; skin lives as long as its solid."""
-        shells, cells = self.run.alive(first, last), self.run.alive_cells(first, last)
+        with reading(f"run {self.run.name}, life of elements in states {first} to {last - 1}"):
+            shells, cells = self.run.alive(first, last), self.run.alive_cells(first, last)
         source = self.structure.face_source
         faces = None
         if shells is not None or cells is not None:
@@ -43,9 +49,9 @@ class RunView:
         """(state, node | face | cell[, component]) in SI; NaN where the run has no value."""
         info, s = wanted.info, self.structure
         if info.location == "node":
-            values = _gather(self.run.field(info.name, first, last), s.node)
+            values = _gather(self._read(info.name, first, last), s.node)
         elif info.location == "cell":
-            values = _gather(self.run.field(info.name, first, last), s.cell_source)
+            values = _gather(self._read(info.name, first, last), s.cell_source)
         else:
             values = self._on_faces(wanted, first, last)
         with contextlib.suppress(UnknownUnits):  # what is not known is kept as it is, and labelled so
@@ -58,6 +64,22 @@ class RunView:
         count = {"node": len(mesh.position), "face": len(mesh.face_nodes), "cell": len(mesh.cell_nodes)}
         return max(count[wanted.info.location], len(self.structure.face_source))
 
+    def _read(self, name: str, first: int, last: int) -> NDArray[np.float32]:
+        with reading(f"run {self.run.name}, {name} of states {first} to {last - 1}"):
+            values = self.run.field(name, first, last)
+        mesh, info = self.run.mesh, self.run.fields[name]
+        count = {"node": len(mesh.position), "face": len(mesh.face_nodes), "cell": len(mesh.cell_nodes)}[info.location]
+        width = (info.components,) if info.components > 1 else ()
+        self._expect(values, (last - first, count, *width), name)
+        return values
+
+    def _expect(self, values: NDArray[Any], shape: tuple[int, ...], name: str) -> None:
+        if values.shape != shape:
+            raise ReadError(
+                f"run {self.run.name}: its reader gave {name} of shape {values.shape}, expected {shape}; the file is "
+                "damaged, or the reader is at fault"
+            )
+
     def _on_faces(self, wanted: Field, first: int, last: int) -> NDArray[np.float32]:
         """Values of shells, and on the skin of solids those of the solid behind."""
         source, name = self.structure.face_source, wanted.info.name
@@ -65,9 +87,9 @@ class RunView:
         out = np.full((last - first, len(source), *width), np.nan, np.float32)
         shell = source >= 0
         if name in self.run.fields and shell.any():
-            out[:, shell] = self.run.field(name, first, last)[:, source[shell]]
+            out[:, shell] = self._read(name, first, last)[:, source[shell]]
         for other in cell_fields(self.run, name) if not shell.all() else ():
-            values = self.run.field(other, first, last)[:, -1 - source[~shell]]
+            values = self._read(other, first, last)[:, -1 - source[~shell]]
             out[:, ~shell] = np.where(np.isnan(values), out[:, ~shell], values)
         return out
 

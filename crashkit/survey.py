@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from crashkit.errors import CrashkitError, DataError, ReadError
 from crashkit.parameter_table import read_parameter_table
 from crashkit.readers import reader_for
+from crashkit.readers._checks import reading
 from crashkit.readers.base import FieldInfo, Run, Runs
 from crashkit.structure import Structure, matched, structure_of
 from data_schema import DIMENSIONS, VARIABLES, to_si, unit_system
@@ -140,7 +141,8 @@ def survey(
         for index, name, run in each_run(source, choice, out, stop):
             tell(name)
             try:
-                found = _look(run, name, source, index, choice, out)
+                with reading(source):
+                    found = _look(run, name, source, index, choice, out)
                 if table is not None:
                     found = replace(found, parameters=_from_table(found, table.row(name), out, table.path))
                 out.found.append(_same_parameters(found, out))
@@ -162,13 +164,14 @@ def survey(
 
 def each_run(source: Path, choice: Choice, out: Survey, stop: bool) -> Iterator[tuple[int, str, Run]]:
     """(place in the source, name in the dataset, run); runs that cannot be opened are refused."""
-    reader = reader_for(source, choice.reader)
-    runs = reader.runs(source, **dict(choice.reader_options))
+    with reading(source):
+        runs = reader_for(source, choice.reader).runs(source, **dict(choice.reader_options))
     index = -1
     while True:
         index += 1
         try:
-            run = next(runs, None)
+            with reading(source):
+                run = next(runs, None)
         except ReadError as error:
             if stop:
                 raise
@@ -187,10 +190,9 @@ def each_run(source: Path, choice: Choice, out: Survey, stop: bool) -> Iterator[
 def reopen(found: Found, choice: Choice) -> Run:
     """The run `found`, opened again where it was found."""
     runs = reader_for(found.source, choice.reader).runs(found.source, **dict(choice.reader_options))
-    try:
-        run = runs.open(found.run) if isinstance(runs, Runs) else _at(runs, found.index)
-    except KeyError:
-        run = None
+    with reading(found.source):
+        known = not isinstance(runs, Runs) or found.run in runs.names
+        run = None if not known else runs.open(found.run) if isinstance(runs, Runs) else _at(runs, found.index)
     if run is None or run.name != found.run or len(run.time) != len(found.time):
         raise ReadError(f"{found.source}: run {found.name} has changed since it was first looked at; start again")
     return run

@@ -278,6 +278,11 @@ def _memory(shape: tuple[int, ...]) -> NDArray[np.float32]:
     return values
 
 
+def let_memory_go() -> None:
+    """Give back what is kept from run to run."""
+    _kept.__dict__.clear()
+
+
 class _Turn:
     """Values (state, node, ...) put in by states and taken out by nodes; in a file where they are many."""
 

@@ -396,3 +396,36 @@ def test_something_else_under_the_name_is_not_touched(place: Place, suffix: str)
 def test_missing_source_is_told(tmp_path: Path) -> None:
     with pytest.raises(ReadError, match="no such file or folder"):
         ingest(tmp_path / "nothing", tmp_path / "out.zarr")
+
+
+# Readers at fault
+
+
+class Faulty(MemoryRun):
+    """A run whose reader breaks down, or gives something else than it promised."""
+
+    def __init__(self, answer: object) -> None:
+        super().__init__("bad")
+        self._answer = answer
+
+    def displacement(self, first: int, last: int) -> np.ndarray:
+        if isinstance(self._answer, Exception):
+            raise self._answer
+        return self.moved[first:last, : self._answer]  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("answer", "told"),
+    [
+        (
+            IndexError("list index out of range"),
+            "run bad, displacement of states 0 to 4: cannot be read .*out of range",
+        ),
+        (OSError(5, "Input/output error"), "run bad, displacement of states 0 to 4: cannot be read"),
+        (9, r"run bad: its reader gave displacement of shape \(5, 9, 3\), expected \(5, 17, 3\)"),
+    ],
+)
+def test_reader_at_fault_costs_its_run_only(place: Place, answer: object, told: str) -> None:
+    with pytest.raises(ReadError, match=told):
+        place.try_ingest(MemoryRun("good"), Faulty(answer))
+    assert place.ingest(MemoryRun("good"), Faulty(answer), on_error="skip")["sim"].values.tolist() == ["good"]
