@@ -127,7 +127,6 @@ class Peer(nn.Module):
 
     def take_weights(self, ours: Ours) -> None:
         """The same network: weights of `ours`, and its lambda_max where the peer would guess one."""
-        n = self.n_nodes
         with torch.no_grad():
             for theirs, mine in (
                 (self.encode_convs, ours.encoder.convolutions.layers),
@@ -137,11 +136,8 @@ class Peer(nn.Module):
                     conv.bias.copy_(layer.bias)
                     for linear, weight in zip(conv.lins, layer.weight):
                         linear.weight.copy_(weight.t())
-            by_node = ours.encoder.dense.weight.view(LATENT, -1, n).transpose(1, 2).reshape(LATENT, -1)
-            self.encode_dense.weight.copy_(by_node)
-            self.encode_dense.bias.copy_(ours.encoder.dense.bias)
-            self.decode_dense.weight.copy_(ours.decoder.dense.weight.view(-1, n, LATENT).transpose(0, 1).flatten(0, 1))
-            self.decode_dense.bias.copy_(ours.decoder.dense.bias.view(-1, n).t().flatten())
+            self.encode_dense.load_state_dict(ours.encoder.dense.state_dict())
+            self.decode_dense.load_state_dict(ours.decoder.dense.state_dict())
             self.mlp.load_state_dict(ours.mlp.state_dict())
         self.lambda_max = torch.tensor(ours.encoder.convolutions.operator.lambda_max)
 

@@ -1,5 +1,8 @@
 """Graph convolutions on states laid out as [node, batch, channel], and the encoder and decoder stacks made of them.
 
+On a CPU, stacks of Chebyshev convolutions run in compiled code (`surrogates.compiled`) where it could be built. What
+follows is the same in torch, for everything else.
+
 Inside, a state is held as [channel, node, batch]. Then, without a copy, each channel is a matrix (n, b) for the sparse
 operator, all channels are one matrix (c, n*b) whose channels one wide product mixes, the powers of the operator stand
 below each other as further channels, and the dense layer at the latent reads the state as (c*n, b). A state whose
@@ -28,7 +31,6 @@ import math
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -40,6 +42,8 @@ from scipy.sparse.linalg import eigsh
 from torch import Tensor, nn
 from torch.nn import functional
 
+from surrogates import compiled
+from surrogates.chebyshev import of_powers, of_terms
 from surrogates.errors import SurrogateError
 
 Kind = Literal["cheb", "gcn", "gcn2"]
@@ -81,6 +85,7 @@ class GraphOperator:
         self.matrix: sparse.csr_matrix = sparse.csr_matrix(matrix)
         self.matrix.sort_indices()
         self._tensors: dict[tuple[torch.device, torch.dtype, int], Tensor] = {}
+        self.compiled: dict[torch.dtype, Any] = {}  # what `surrogates.compiled` made of it
 
     def dense_form(self) -> GraphOperator:
         """The same operator held as a dense matrix (n, n), as torch.export and ONNX need it."""
@@ -213,27 +218,6 @@ class _Propagate(torch.autograd.Function):
         return _Propagate.apply(tangents[0], ctx.operator)
 
 
-@cache
-def _powers_of_chebyshev(order: int, device: torch.device, dtype: torch.dtype) -> Tensor:
-    """(order, order), row k: the coefficients of T_k in plain powers, from T_k = 2 x T_{k-1} - T_{k-2}."""
-    rows = np.zeros((order, order))
-    for k in range(order):
-        rows[k, : k + 1] = np.polynomial.chebyshev.cheb2poly(np.eye(k + 1)[k])
-    return torch.from_numpy(rows).to(device, dtype)
-
-
-def _of_powers(weight: Tensor) -> Tensor:
-    """The weights V_j (order, in, out) with sum_k T_k(L) x W_k = sum_j L^j x V_j."""
-    table = _powers_of_chebyshev(len(weight), weight.device, weight.dtype)
-    return torch.mm(table.t(), weight.view(len(weight), -1)).view(weight.shape)
-
-
-def _of_terms(gradient: Tensor) -> Tensor:
-    """The gradient by W_k (order, in, out) from that by V_j: the adjoint of `_of_powers`."""
-    table = _powers_of_chebyshev(len(gradient), gradient.device, gradient.dtype)
-    return torch.mm(table, gradient.reshape(len(gradient), -1)).view(gradient.shape)
-
-
 def _powers(operator: GraphOperator, powers: Tensor) -> Tensor:
     """(order, c, n, b) holding x in its first place -> (order*c, n, b) with x, L x, .. L^(order-1) x, in place."""
     for k in range(1, len(powers)):
@@ -259,18 +243,18 @@ class _Cheb(torch.autograd.Function):
     def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor | None, operator: GraphOperator, elu: bool) -> Tensor:
         order, channels, width = weight.shape
         _, n, batch = x.shape
-        of_powers = _of_powers(weight)
+        by_powers = of_powers(weight)
         if channels <= width:
             powers = x.new_empty(order, channels, n, batch)
             powers[0] = x
             kept = _powers(operator, powers)
-            mix = of_powers.reshape(order * channels, width).t()
+            mix = by_powers.reshape(order * channels, width).t()
             flat = kept.view(order * channels, -1)
             out = mix @ flat if bias is None else torch.addmm(bias[:, None], mix, flat)
             out = out.view(width, n, batch)
         else:
             kept = x.contiguous()
-            mix = of_powers.transpose(1, 2).reshape(order * width, channels)
+            mix = by_powers.transpose(1, 2).reshape(order * width, channels)
             parts = (mix @ kept.view(channels, -1)).view(order, width, n, batch)
             out = _horner(operator, parts)
             if bias is not None:
@@ -298,15 +282,15 @@ class _Cheb(torch.autograd.Function):
         gradient_x: Tensor | None = None
         if channels <= width:
             flat = gradient.view(width, -1)
-            of_powers = (flat @ kept.view(order * channels, -1).t()).t().reshape(order, channels, width)
+            by_powers = (flat @ kept.view(order * channels, -1).t()).t().reshape(order, channels, width)
             if ctx.needs_input_grad[0]:
                 gradient_x = _horner(ctx.operator, (mix.t() @ flat).view(order, channels, n, batch))
         else:
             flat = _powers(ctx.operator, powers).view(order * width, -1)
-            of_powers = (flat @ kept.view(channels, -1).t()).view(order, width, channels).transpose(1, 2)
+            by_powers = (flat @ kept.view(channels, -1).t()).view(order, width, channels).transpose(1, 2)
             if ctx.needs_input_grad[0]:
                 gradient_x = (mix.t() @ flat).view(channels, n, batch)
-        return gradient_x, _of_terms(of_powers), gradient_bias, None, None
+        return gradient_x, of_terms(by_powers), gradient_bias, None, None
 
 
 def _plain_cheb(x: Tensor, weight: Tensor, bias: Tensor | None, operator: GraphOperator) -> Tensor:
@@ -500,6 +484,14 @@ class Convolutions(nn.Module):
             layers = [GCN2Conv(width, operator, layer=i + 1, elu=True) for i in range(len(steps))]
         self.layers = nn.ModuleList(layers)
 
+    def of_chebyshev(self) -> tuple[GraphOperator, list[Tensor], list[Tensor], list[bool]]:
+        """Operator, weights, biases and whether ELU follows, of a stack of Chebyshev convolutions."""
+        layers = [layer for layer in self.layers if isinstance(layer, ChebConv)]
+        biases = [
+            layer.weight.new_zeros(layer.weight.shape[2]) if layer.bias is None else layer.bias for layer in layers
+        ]
+        return self.operator, [layer.weight for layer in layers], biases, [layer.elu for layer in layers]
+
     def forward(self, x: Tensor) -> Tensor:
         x = self.before(x)
         x0 = x
@@ -511,7 +503,7 @@ class Convolutions(nn.Module):
 class GraphEncoder(nn.Module):
     """Convolutions, then one dense linear layer: x (node, batch, channels[0]) -> z (batch, latent).
 
-    The dense layer's inputs are ordered channel by channel, node by node within a channel.
+    The dense layer's inputs are ordered node by node, channel by channel within a node.
     Source: Kneifl et al. 2024, section 3.3 and table 1.
     """
 
@@ -519,20 +511,26 @@ class GraphEncoder(nn.Module):
         self, operator: GraphOperator, latent: int, channels: Sequence[int] = (3, 6, 12, 24), order: int = 3
     ) -> None:
         super().__init__()
+        self.channels = channels[0]
         self.convolutions = Convolutions(operator, channels, order, linear_end=False)
         self.dense = nn.Linear(operator.n_nodes * channels[-1], latent)
 
     def forward(self, x: Tensor) -> Tensor:
-        h = self.convolutions(x).permute(2, 0, 1)
-        flat = h.reshape(-1, h.shape[2])
-        if self.convolutions.operator.form == "dense":
-            return self.dense(flat.t())
-        return _Encode.apply(flat, self.dense.weight, self.dense.bias)
+        operator = self.convolutions.operator
+        if compiled.usable(x, operator):
+            _check_state(x, operator, self.channels)
+            return compiled.encode(x, *self.convolutions.of_chebyshev(), (self.dense.weight, self.dense.bias))
+        h = self.convolutions(x)
+        if operator.form == "dense":
+            return functional.linear(h.transpose(0, 1).flatten(1), self.dense.weight, self.dense.bias)
+        weight = self.dense.weight.unflatten(1, (operator.n_nodes, -1)).transpose(1, 2).flatten(1)
+        return _Encode.apply(h.permute(2, 0, 1).reshape(-1, h.shape[1]), weight, self.dense.bias)
 
 
 class GraphDecoder(nn.Module):
     """One dense layer with ELU, then convolutions, the last linear: z (batch, latent) -> (node, batch, channels[-1]).
 
+    The dense layer's results are ordered as the encoder's inputs to its own.
     Source: Kneifl et al. 2024, section 3.3 and table 1: the encoder in reverse order.
     """
 
@@ -541,15 +539,21 @@ class GraphDecoder(nn.Module):
     ) -> None:
         super().__init__()
         self.n_nodes = operator.n_nodes
+        self.channels = channels[0]
         self.dense = nn.Linear(latent, operator.n_nodes * channels[0])
         self.convolutions = Convolutions(operator, channels, order, linear_end=True)
 
     def forward(self, z: Tensor) -> Tensor:
-        if self.convolutions.operator.form == "dense":
-            h = functional.elu(self.dense(z)).t()
-        else:
-            h = _Decode.apply(z, self.dense.weight, self.dense.bias)
-        return self.convolutions(h.reshape(-1, self.n_nodes, z.shape[0]).permute(1, 2, 0))
+        operator, (weight, bias) = self.convolutions.operator, (self.dense.weight, self.dense.bias)
+        if compiled.usable(z, operator):
+            return compiled.decode(z, *self.convolutions.of_chebyshev(), (weight, bias))
+        if operator.form == "dense":
+            h = functional.elu(functional.linear(z, weight, bias))
+            return self.convolutions(h.unflatten(1, (self.n_nodes, self.channels)).transpose(0, 1))
+        weight = weight.unflatten(0, (self.n_nodes, self.channels)).transpose(0, 1).flatten(0, 1)
+        bias = bias.unflatten(0, (self.n_nodes, self.channels)).t().flatten()
+        h = _Decode.apply(z, weight, bias)
+        return self.convolutions(h.reshape(self.channels, self.n_nodes, -1).permute(1, 2, 0))
 
 
 @contextmanager

@@ -202,13 +202,13 @@ def test_encoder_and_decoder_have_the_parameters_of_the_paper():
     assert count == 18_103
 
 
-def test_dense_layer_of_the_encoder_runs_over_channels_then_nodes():
+def test_dense_layer_of_the_encoder_runs_over_nodes_then_channels():
     operator = GraphOperator(random_edges(5, 8, 1), 5)
     encoder = GraphEncoder(operator, 2, (3, 4)).to(DOUBLE)
     x = torch.randn(5, 1, 3, dtype=DOUBLE)
     h = encoder.convolutions(x)[:, 0].detach().numpy()
-    weight = encoder.dense.weight.detach().numpy().reshape(2, 4, 5)
-    expected = np.einsum("rcn,nc->r", weight, h) + encoder.dense.bias.detach().numpy()
+    weight = encoder.dense.weight.detach().numpy().reshape(2, 5, 4)
+    expected = np.einsum("rnc,nc->r", weight, h) + encoder.dense.bias.detach().numpy()
     np.testing.assert_allclose(encoder(x)[0].detach().numpy(), expected, atol=1e-12)
 
 
