@@ -44,8 +44,8 @@ def predict(
     level       a mesh level of the model; without it the finest it has
     full        on all nodes of the mesh, lifted from the level
 
-    The coordinate `node` says which node of the full mesh each one is. Parameters and times outside the trained range
-    get a warning that names the range, also in the attribute `warnings`.
+    The coordinate `node` says which node of the full mesh each one is; the parameters are scalar coordinates.
+    Parameters and times outside the trained range get a warning that names the range, also in the attribute `warnings`.
 
     Raises DataError for parameters that are unknown, missing or no numbers, SurrogateError for a level it lacks.
     """
@@ -67,13 +67,13 @@ def predict(
         coords={
             "time": ("time", at, {"units": "s"}),
             "node": ("node", surrogate.graphs.kept(0 if full else number)),
+            **{n: ((), v, {"units": unit}) for n, v, unit in zip(ranges.names, values, ranges.units, strict=True)},
         },
         name="displacement",
         attrs={
             "units": "m",
             "model": next(name for name, k in surrogate.level_names.items() if k == number),
             "level": 0 if full else number,
-            **{n: f"{v:g} {unit}" for n, v, unit in zip(ranges.names, values, ranges.units, strict=True)},
             "warnings": "; ".join(outside),
         },
     )
@@ -135,6 +135,11 @@ def command(
     ] = "",
     level: Annotated[int | None, typer.Option(help="Mesh level.", show_default="the finest it has")] = None,
     full: Annotated[bool, typer.Option("--full", help="On the full mesh.")] = False,
+    band: Annotated[
+        float | None,
+        typer.Option(help="Also how far nodes may be off, so that this share (0.9) lies within.", show_default=False),
+    ] = None,
+    sensitivity: Annotated[bool, typer.Option("--sensitivity", help="Also the derivatives by each parameter.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Predict one run, and write it for ParaView or as arrays."""
@@ -148,12 +153,14 @@ def command(
         run = predict(surrogate, _given(param or ()), _times(time), level, full)
     for sentence in filter(None, run.attrs["warnings"].split("; ")):
         say(f"warning: {sentence}")
-    files = write_prediction(surrogate, run, output)
+    further = further_arrays(surrogate, run, band, sensitivity)
+    files = write_prediction(surrogate, run, output, further)
     largest = float((run**2).sum("xyz").max() ** 0.5)
     if json:
         print_json(
             {
-                "files": files, "level": run.attrs["level"], "states": run.sizes["time"], "nodes": run.sizes["node"],
+                "files": files, "arrays": ["displacement", *further], "level": run.attrs["level"],
+                "states": run.sizes["time"], "nodes": run.sizes["node"],
                 "largest_displacement_m": largest, "warnings": run.attrs["warnings"],
             }
         )  # fmt: skip
@@ -164,8 +171,39 @@ def command(
     )
 
 
-def write_prediction(surrogate: Surrogate, run: xr.DataArray, output: Path) -> list[Path]:
-    """Write what `predict` gave to `output`, by its suffix; the mesh comes from the model folder.
+def further_arrays(
+    surrogate: Surrogate, run: xr.DataArray, band: float | None = None, sensitivity: bool = False
+) -> dict[str, tuple[NDArray[np.float32], str]]:
+    """What else can be said of the prediction `run`: name -> (array (time, node) or (time, node, xyz), unit).
+
+    half_width  m, with `band`: that share of nodes and states lies as near to the truth, as far as validation runs tell
+    displacement_by_NAME  with `sensitivity`: derivative by each parameter
+
+    Raises SurrogateError where too few validation runs were held out for a band.
+    """
+    import numpy as np
+
+    number, full = surrogate.level_names[run.attrs["model"]], run.attrs["level"] == 0
+    out: dict[str, tuple[NDArray[np.float32], str]] = {}
+    if band is not None:
+        out["half_width"] = (surrogate.band(band, run["time"].values, number, full=full), "m")
+    if sensitivity:
+        ranges = surrogate.record.ranges
+        at = [float(run[name]) for name in ranges.names]
+        by = surrogate.sensitivity(at, run["time"].values, number)
+        for k, (name, unit) in enumerate(zip(ranges.names, ranges.units, strict=True)):
+            slope = np.ascontiguousarray(by[..., k])
+            out[f"displacement_by_{name}"] = (surrogate.lift(slope, number) if full else slope, f"m ({unit})-1")
+    return out
+
+
+def write_prediction(
+    surrogate: Surrogate,
+    run: xr.DataArray,
+    output: Path,
+    further: Mapping[str, tuple[NDArray[np.float32], str]] | None = None,
+) -> list[Path]:
+    """Write what `predict` gave, and `further_arrays`, to `output` by its suffix; the mesh comes from the model folder.
 
     Raises OutputError where `output` cannot be written, DataError where the model has no mesh or a single-state file
     was asked for several states.
@@ -176,6 +214,7 @@ def write_prediction(surrogate: Surrogate, run: xr.DataArray, output: Path) -> l
     from crashkit.mesh.probe import without_sides
     from crashkit.paraview import write_paraview
 
+    further = further or {}
     level = int(run.attrs["level"])
     if surrogate.points is None or surrogate.faces is None:
         raise DataError(f"{output}: the model was stored without its mesh; train it again from a dataset")
@@ -188,7 +227,7 @@ def write_prediction(surrogate: Surrogate, run: xr.DataArray, output: Path) -> l
             with output.open("wb") as file:
                 np.savez_compressed(
                     file, displacement=run.values, time=run["time"].values, node=run["node"].values,
-                    reference_position=points, faces=faces,
+                    reference_position=points, faces=faces, **{k: v for k, (v, _) in further.items()},  # type: ignore[arg-type]
                 )  # fmt: skip
         except OSError as error:
             raise OutputError(
@@ -199,9 +238,10 @@ def write_prediction(surrogate: Surrogate, run: xr.DataArray, output: Path) -> l
         raise DataError(
             f"{output}: holds one state, and {run.sizes['time']} were asked for; choose one with --time, or .pvd"
         )
+    arrays = {"displacement": (run.values, "m"), **further}
     return write_paraview(
-        output, points, faces, run["time"].values, point_data={"displacement": run.values}, lines=lines,
-        units={"displacement": "m"},
+        output, points, faces, run["time"].values, point_data={name: values for name, (values, _) in arrays.items()},
+        lines=lines, units={name: unit for name, (_, unit) in arrays.items()},
     )  # fmt: skip
 
 

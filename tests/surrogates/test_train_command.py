@@ -211,6 +211,22 @@ def test_arrays_carry_nodes_and_times(model: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(stored["reference_position"], plate.grid(9)[plate.levels()[1].kept])
 
 
+def test_bands_and_sensitivities_are_written_beside_the_prediction(crash: Path, tmp_path: Path) -> None:
+    overrides = ["level.epochs=1", "validation.share=0.5"]
+    surrogate = crashkit.train(crash, tmp_path / "m", "mh", overrides=overrides, device="cpu")
+    told = tmp_path / "run.npz"
+    code, out, err = run(*asked(tmp_path / "m"), "--full", "--band", 0.8, "--sensitivity", "--json", "-o", told)
+    assert code == 0, err
+    names = [f"displacement_by_{name}" for name in UNITS]
+    assert json.loads(out)["arrays"] == ["displacement", "half_width", *names]
+    mu, step = np.array([20.0, 5.0, 4e8]), np.array([0.01, 0.0, 0.0])
+    slope = (surrogate.predict_full(mu + step) - surrogate.predict_full(mu - step)) / 0.02
+    with np.load(told) as stored:
+        assert stored["half_width"].shape == (7, 81)
+        np.testing.assert_allclose(stored["half_width"], surrogate.band(0.8, full=True), rtol=1e-6)
+        np.testing.assert_allclose(stored[names[0]], slope, atol=2e-3 * np.abs(slope).max())
+
+
 def test_parameters_in_other_units_are_the_same(model: Path) -> None:
     plain = predict(model, {"impact_speed": 20, "impact_angle": 5, "yield_stress": 4e8})
     units = predict(model, {"impact_speed": "72 km/h", "impact_angle": "5deg", "yield_stress": "0.4GPa"})
