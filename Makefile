@@ -21,7 +21,7 @@ check: $(READY)
 	$(BIN)/lint-imports --no-cache
 
 # Installed again only when what is to be installed has changed.
-$(READY): pyproject.toml constraints.txt
+$(READY): pyproject.toml constraints.txt surrogates/_convolution.c
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	touch $@

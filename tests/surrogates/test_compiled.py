@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from shutil import which
+
 import numpy as np
 import pytest
 import torch
@@ -44,8 +47,9 @@ def not_built(monkeypatch):
     return lambda: monkeypatch.setattr(compiled, "library", lambda: None)
 
 
-def test_they_are_built_where_these_tests_run():
-    assert compiled.library() is not None
+def test_they_are_built_where_there_is_a_compiler():
+    compiler = which(os.environ.get("CC", "").split(" ")[0] or "cc") or which("gcc")
+    assert (compiled.library() is not None) == (compiler is not None)
 
 
 @settings(max_examples=25, deadline=None)
