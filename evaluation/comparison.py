@@ -8,6 +8,7 @@ against each other.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -91,12 +92,17 @@ def _some(names: Sequence[str]) -> str:
     return ", ".join(names) if len(names) <= 4 else f"{', '.join(names[:3])}, ... {names[-1]}"
 
 
+def _without_seed(name: str) -> str:
+    """What a folder is called but for its seed: `kart-seed-0` is `kart`."""
+    return re.sub(r"[-_. ]*(seed|s)?[-_. ]*\d+$", "", name) or name
+
+
 def entries(models: Sequence[Model], seeds_as_spread: bool = True) -> tuple[Entry, ...]:
     """The rows of the comparison, in the order the models were given.
 
     Models of equal configuration that differ in nothing but the seed become one row with a spread; otherwise
-    equal names are told apart by the model's own name. Raises EvaluationError for no model, for a predictor on two
-    rows of the same label and for one model given twice.
+    equal names are told apart by the model's own name, without the seed where there are several. Raises
+    EvaluationError for no model, for a predictor on two rows of the same label and for one model given twice.
     """
     if not models:
         raise EvaluationError("no model to evaluate; give at least one model folder")
@@ -116,8 +122,9 @@ def entries(models: Sequence[Model], seeds_as_spread: bool = True) -> tuple[Entr
     times = [name for name, _ in rows]
     out = []
     for (name, _), members in rows.items():
-        first = models[members[0][0][0]]
-        label = name if times.count(name) == 1 else f"{name} ({first.name})"
+        folder = models[members[0][0][0]].name
+        told_apart = f"{name} ({_without_seed(folder) if len(members) > 1 else folder})"
+        label = name if times.count(name) == 1 else told_apart
         out.append(Entry(label, members[0][1].level, tuple(key for key, _ in members)))
     labels = [e.label for e in out]
     for label in labels:

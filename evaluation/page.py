@@ -9,11 +9,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from evaluation.figures.kind import Drawing, Kind, drawn, image, write
-from evaluation.figures.style import Sheet
+from evaluation.figures.style import Sheet, readable, span
 from evaluation.verdict import Statement
 
 PHONE_WIDTH = 9.0  # cm
+_UNITS = {"_m_per_s": "m/s", "_percent": "%", "_cm": "cm", "_ms": "ms"}  # endings of names of columns
 
 
 @dataclass(frozen=True)
@@ -126,10 +129,13 @@ def show_table(
 ) -> ShownTable:
     """Columns as a table of the page.
 
-    headings  column -> what stands above it; only these columns are shown, in this order (default: all)
+    headings  column -> what stands above it; only these columns are shown, in this order (default: all, in the
+              units that people read)
     lowest    columns in which the smallest number is marked as the best
     """
-    headings = headings or {name: name.replace("_", " ") for name in columns}
+    if headings is None:
+        columns = dict(_readable_column(name, values) for name, values in columns.items())
+        headings = {name: name for name in columns}
     shown = {name: columns[name] for name in headings}
     textual = {name: all(isinstance(v, str) for v in values) for name, values in shown.items()}
     best = {name: min((v for v in shown[name] if v == v), default=None) for name in lowest if name in shown}
@@ -142,6 +148,18 @@ def show_table(
         for k in range(count)
     )
     return ShownTable(title, tuple(Column(headings[n], textual[n]) for n in shown), rows, note)
+
+
+def _readable_column(name: str, values: Sequence[Any]) -> tuple[str, Sequence[Any]]:
+    """A column of a CSV file as people read it: `yield_stress (Pa)` in MPa, `peak_cm` under `peak (cm)`."""
+    for ending, unit in _UNITS.items():
+        if name.endswith(ending):
+            return span(name.removesuffix(ending), unit), values
+    start, found, unit = name.removesuffix(")").rpartition(" (")
+    if not found or not all(isinstance(v, float) for v in values):
+        return name.replace("_", " "), values
+    numbers, unit = readable(np.array(values), unit)
+    return span(start, unit), numbers.tolist()
 
 
 def plain(value: Any) -> str:
@@ -157,7 +175,7 @@ def plain(value: Any) -> str:
             return f"{value:.2g}"
         if abs(value) < 0.01:
             return f"{value:.4f}".rstrip("0").rstrip(".") or "0"
-        return f"{value:.3g}" if abs(value) < 1000 else _grouped(round(value), 10000)
+        return f"{value:#.3g}".rstrip(".") if abs(value) < 999.5 else _grouped(round(value), 10000)
     return str(value)
 
 

@@ -286,7 +286,10 @@ def _sheet_of(rows: Sequence[Sequence[Panel]], scales: Sequence[Scale], sheet: S
                 figure.text(*at, panel.title, va="top", ha="left", weight="bold", size=9, color=INK, linespacing=1.35)
             if beside:
                 box = (sheet.width - bar + 0.1, top - heights[k] + 0.05 * image_height, 0.28, 0.7 * image_height)
-                _bar(figure.add_axes(_share(box, sheet.width, total)), scales[min(k, len(scales) - 1)], "vertical")
+                ticks = 5 if box[3] > 1.6 else 3
+                _bar(
+                    figure.add_axes(_share(box, sheet.width, total)), scales[min(k, len(scales) - 1)], "vertical", ticks
+                )
             top -= heights[k]
         if below:
             each = sheet.width / len(scales)
@@ -306,7 +309,7 @@ def _share(box: tuple[float, float, float, float], width: float, height: float) 
     return left / width, bottom / height, across / width, up / height
 
 
-def _bar(axes: Axes, scale: Scale, orientation: str) -> None:
+def _bar(axes: Axes, scale: Scale, orientation: str, ticks: int = 5) -> None:
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.ticker import MaxNLocator
@@ -315,7 +318,7 @@ def _bar(axes: Axes, scale: Scale, orientation: str) -> None:
     mappable = ScalarMappable(Normalize(low, high if high > low else low + 1e-12), scale.colours)
     bar = axes.figure.colorbar(mappable, cax=axes, orientation=orientation)
     bar.outline.set_visible(False)  # type: ignore[operator]
-    bar.locator = MaxNLocator(5)
+    bar.locator = MaxNLocator(ticks)
     bar.update_ticks()
     if orientation == "vertical":  # written across, above the bar: along it, it may be longer than the bar
         axes.set_title(scale.label.replace(" (", "\n("), weight="normal", size=8, color=INK)

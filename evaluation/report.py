@@ -16,6 +16,7 @@ from evaluation.figures import ORDER, drawings, sheet_of
 from evaluation.figures.kind import Columns, to_csv
 from evaluation.figures.style import CM, called
 from evaluation.page import Page, ShownFigure, ShownTable, ShownView, plain_json, render_page, show_figure, show_table
+from evaluation.predictor import Model
 from evaluation.result import Evaluation
 from evaluation.verdict import RULES, statements
 
@@ -25,8 +26,8 @@ _HEADINGS = {
     "reduction_cm": "reduction alone (cm)", "pod_floor_cm": "POD floor, same size (cm)", "latent": "latent size",
     "parameters": "parameters", "training_s": "training (s)", "prediction_lifted_ms": "ms a state",
 }  # fmt: skip
-_ALL_HEADINGS = _HEADINGS | {
-    "level": "level", "seeds": "seeds", "worst_run": "which run", "lifting_cm": "lifting alone (cm)",
+_FURTHER_HEADINGS = {
+    "model": "model", "level": "level", "seeds": "seeds", "worst_run": "worst run", "lifting_cm": "lifting alone (cm)",
     "seconds_per_epoch": "s an epoch", "prediction_ms": "ms a state, own level",
     "prediction_lifted_ms": "ms a state, full mesh", "single_prediction_ms": "ms for one state alone, full mesh",
 }  # fmt: skip
@@ -154,7 +155,7 @@ def _subtitle(evaluation: Evaluation) -> str:
     reference = evaluation.reference
     name = reference.attributes.get("title") or evaluation.context.get("Dataset", "")
     return (
-        f"{name + ': ' if name else ''}{len(evaluation.entries)} models on {len(evaluation.runs)} test runs that "
+        f"{name + ': ' if name else ''}{len(evaluation.leaders)} models on {len(evaluation.runs)} test runs that "
         f"none of "
         f"them has seen; {len(reference.time)} states of {reference.n_nodes} nodes, which move by "
         f"{evaluation.size * CM:.1f} cm on average"
@@ -170,7 +171,7 @@ def _key_table(performance: Columns) -> ShownTable:
 
 def _tables(performance: Columns, all_tables: Mapping[str, Columns]) -> list[ShownTable]:
     return [
-        show_table("Performance, every column", performance, "", _ALL_HEADINGS, _LOWEST),
+        show_table("Performance, further columns", performance, "", _FURTHER_HEADINGS, _LOWEST),
         show_table("Worst run, worst node, worst time", all_tables["worst"], "Nodes carry the solver's own numbers."),
         *(
             [
@@ -195,11 +196,15 @@ def _file_table(evaluation: Evaluation, folder: Path) -> list[ShownTable]:
 
 
 def _details(evaluation: Evaluation) -> list[tuple[str, str]]:
-    return [
-        (
-            f"Configuration of {model.name} ({', '.join(p.name for p in model.predictors)}"
-            + (f", seed {model.seed})" if model.seed is not None else ")"),
-            json.dumps(plain_json(dict(model.configuration)), indent=1, sort_keys=True),
-        )
-        for model in evaluation.models
-    ]
+    """Each configuration once, as `crashkit train --config` reads it, under the models that have it."""
+    import yaml
+
+    alike: dict[str, list[Model]] = {}
+    for model in evaluation.models:
+        text = yaml.safe_dump(plain_json(dict(model.configuration)), default_flow_style=None, width=100)
+        alike.setdefault(text, []).append(model)
+    return [(f"Configuration of {', '.join(map(_with_seed, models))}", text) for text, models in alike.items()]
+
+
+def _with_seed(model: Model) -> str:
+    return model.name if model.seed is None else f"{model.name} (seed {model.seed})"

@@ -115,6 +115,14 @@ class Evaluation:
         """Entries by mean error, best first."""
         return tuple(sorted(self.entries, key=lambda e: self.scores[e.label].mean))
 
+    @property
+    def leaders(self) -> tuple[Entry, ...]:
+        """The most accurate row of each model, best first: of the levels of a cascade one alone."""
+        best: dict[int, Entry] = {}
+        for entry in self.ranked:
+            best.setdefault(entry.keys[0][0], entry)
+        return tuple(best.values())
+
 
 def predictors_of(models: Sequence[Model]) -> dict[Key, Predictor]:
     """Every predictor of every model under its two numbers."""

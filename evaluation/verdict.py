@@ -24,7 +24,7 @@ POOR_RELATIVE = 0.15  # a relative displacement error above this is called out
 
 RULES = (
     f"Two models are told apart only if the 95 % interval of the mean difference of their errors over the test runs "
-    f"(paired bootstrap, 4000 resamples, fixed seed) leaves zero out. "
+    f"and the seeds of training (paired bootstrap, 4000 resamples, fixed seed) leaves zero out. "
     f"Most accurate: lowest mean node error on the full mesh. "
     f"Many queries: the fastest on the full mesh among those at most {100 * (NEAR - 1):.0f} % worse than the best. "
     f"Visualisation: among models that predict on a coarse mesh, the one with the fewest nodes at most "
@@ -33,7 +33,7 @@ RULES = (
     f"A warning stands wherever there are fewer than {FEW_RUNS} test runs, a relative displacement error above "
     f"{100 * POOR_RELATIVE:.0f} %, a group of nodes whose error exceeds half of its own motion, a finer level that is "
     f"not better than the coarser one, a baseline that is better than a multi-hierarchical model, test runs outside "
-    f"the range of the training runs, or a model that moves nodes in the first state by more than "
+    f"the range of the training runs, models trained once, or a model that moves nodes in the first state by more than "
     f"{100 * START_SHARE:.0f} % of its mean error."
 )
 
@@ -59,19 +59,37 @@ def statements(evaluation: Evaluation) -> list[Statement]:
 
 
 def difference(a: NDArray[np.float64], b: NDArray[np.float64], resamples: int = 4000) -> tuple[float, float, float]:
-    """Mean of `a - b` over runs (run,) and its 95 % interval by a paired bootstrap; seeded. One run: the interval
-    is infinite, since one run says nothing about the next."""
-    delta = np.asarray(a, dtype=np.float64) - np.asarray(b, dtype=np.float64)
-    if len(delta) < 2:
-        return float(delta.mean()), -np.inf, np.inf
-    draws = np.random.default_rng(0).integers(0, len(delta), (resamples, len(delta)))
-    low, high = np.quantile(delta[draws].mean(axis=1), (0.025, 0.975))
-    return float(delta.mean()), float(low), float(high)
+    """Mean of `a - b` and its 95 % interval by a bootstrap over runs, the same for both, and over the seeds of each.
+
+    a, b  (seed, run) m, or (run,) of one seed. Seeded. One run: the interval is infinite, since one run says nothing
+          about the next. See Efron and Tibshirani, An Introduction to the Bootstrap (1993), chapter 13.
+    """
+    rng = np.random.default_rng(0)
+    errors = [np.atleast_2d(np.asarray(x, dtype=np.float64)) for x in (a, b)]
+    mean = float(errors[0].mean() - errors[1].mean())
+    count = errors[0].shape[1]
+    if count < 2:
+        return mean, -np.inf, np.inf
+    runs = rng.integers(0, count, (resamples, count))
+    drawn = []
+    for x in errors:
+        seeds = rng.integers(0, len(x), (resamples, len(x)))
+        drawn.append(np.take_along_axis(x[seeds].mean(axis=1), runs, axis=1).mean(axis=1))
+    low, high = np.quantile(drawn[0] - drawn[1], (0.025, 0.975))
+    return mean, float(low), float(high)
+
+
+def _between(evaluation: Evaluation, a: Entry, b: Entry) -> tuple[float, float, float]:
+    """`difference` of two rows. Levels of one cascade share their seeds, so these are paired too."""
+    ours, theirs = (masked_mean(evaluation.scores[e.label].e2, axis=2) for e in (a, b))
+    if [model for model, _ in a.keys] == [model for model, _ in b.keys]:
+        return difference(ours - theirs, np.zeros_like(theirs))
+    return difference(ours, theirs)
 
 
 def clearly_better(evaluation: Evaluation, a: Entry, b: Entry) -> bool:
-    """Whether `a` has the lower error than `b` beyond what another choice of test runs would explain."""
-    return difference(evaluation.scores[a.label].of_runs, evaluation.scores[b.label].of_runs)[2] < 0
+    """Whether `a` has the lower error than `b` beyond what other test runs or other seeds would explain."""
+    return _between(evaluation, a, b)[2] < 0
 
 
 def _cm(value: float) -> str:
@@ -184,7 +202,7 @@ def _families(evaluation: Evaluation) -> list[Statement]:
         return []
     rival = full[0]
     ours = coarse[0]
-    delta, low, high = difference(evaluation.scores[ours.label].of_runs, evaluation.scores[rival.label].of_runs)
+    delta, low, high = _between(evaluation, ours, rival)
     wins = int((evaluation.scores[ours.label].of_runs < evaluation.scores[rival.label].of_runs).sum())
     count = len(evaluation.runs)
     errors = f"{_cm(_error(evaluation, ours))} against {_cm(_error(evaluation, rival))}"
@@ -248,7 +266,11 @@ def _warnings(evaluation: Evaluation) -> list[Statement]:
                 f"There are {count} test runs. Differences smaller than the spread between runs mean little.",
             )
         )
-    if all(len(e.keys) == 1 for e in evaluation.entries):
+    once = [e.label for e in evaluation.leaders if len(e.keys) == 1]
+    if len(once) < len(evaluation.leaders) and once:
+        text = f"Trained once, so without a spread: {_listed(once)}. How much of their rank is luck is not known."
+        out.append(Statement("warning", "One seed alone", text))
+    if len(once) == len(evaluation.leaders):
         out.append(
             Statement(
                 "warning",

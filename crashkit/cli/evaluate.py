@@ -324,7 +324,7 @@ def _context(dataset: Path, reference: Reference, models: Sequence[Model], split
             f"{n} ({u})" for n, u in zip(reference.parameter_names, reference.parameter_units, strict=True)
         )
         or "none",
-        "States": f"{len(reference.time)} from {reference.time[0] * 1e3:g} to {reference.time[-1] * 1e3:g} ms",
+        "States": f"{len(reference.time)} from {reference.time[0] * 1e3:.4g} to {reference.time[-1] * 1e3:.4g} ms",
         "Meshes": ", ".join(f"{reference.level_nodes(k)} nodes (level {k})" for k in range(len(reference.levels) + 1)),
         "Models": ", ".join(m.name for m in models),
         "Versions": f"Python {platform.python_version()}, {', '.join(packages)}",
@@ -404,15 +404,12 @@ def command(
     several = any(row.seeds > 1 for row in rows)
     table(
         f"Mean node error of {len(result.runs)} test runs on the full mesh, cm",
-        (
-            "model", "nodes", "error", *(["± seeds"] if several else []), "% of motion", "worst run", "reduced",
-            "POD floor", "train s", "ms",
-        ),
+        ("model", "nodes", "error", *(["± seeds"] if several else []), "% of motion", "worst run", "train s", "ms"),
         (
             (
-                r.model, r.nodes, f"{r.error_cm:.3f}", *([f"{r.spread_cm:.3f}"] if several else []),
-                f"{100 * r.relative:.1f}", f"{r.worst_run_cm:.2f}", f"{r.reduction_cm:.3f}", f"{r.pod_floor_cm:.3f}",
-                _or_dash(r.training_s, ".0f"), _or_dash(r.prediction_lifted_ms, ".2g"),
+                r.model, r.nodes, f"{r.error_cm:.3f}", *([_or_dash(r.spread_cm, ".3f")] if several else []),
+                f"{100 * r.relative:.1f}", f"{r.worst_run_cm:.2f}", _or_dash(r.training_s, ".0f"),
+                _or_dash(r.prediction_lifted_ms, ".2g"),
             )
             for r in rows
         ),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evaluation.figures.kind import Columns, Kind
-from evaluation.figures.style import CM, INK, Sheet, few_log_ticks
+from evaluation.figures.style import CM, INK, Sheet, few_log_ticks, short
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -49,7 +49,7 @@ class Budgets:
         }
 
     def draw(self, sheet: Sheet) -> Figure:
-        figure, (epoch, predict, trade) = sheet.panels(3, height=6.6)
+        figure, (epoch, predict, trade) = sheet.panels(3, height=max(6.6, 2.6 + 0.7 * len(self.budgets)))
         trained = [m for m, b in self.budgets.items() if np.isfinite(b.seconds_per_epoch)]
         _bars(epoch, sheet, trained, [self.budgets[m].seconds_per_epoch for m in trained])
         epoch.set_title("training")
@@ -60,8 +60,12 @@ class Budgets:
             colour, b = sheet.style(m).colour, self.budgets[m]
             predict.barh(y + 0.19, b.own, 0.36, color=colour)
             predict.barh(y - 0.19, b.lifted, 0.36, color=colour, alpha=0.4)
+            predict.text(b.lifted, y - 0.19, f" {short(b.lifted)}", va="center", fontsize=7, color=INK)
         predict.set_yticks(at, models)
         predict.set_xscale("log")
+        predict.set_xlim(
+            min(b.own for b in self.budgets.values()) / 2, 3 * max(b.lifted for b in self.budgets.values())
+        )
         few_log_ticks(predict.xaxis)
         predict.set_xlabel("ms a state, pale: lifted")
         predict.set_title("prediction")
@@ -104,12 +108,14 @@ def _bars(ax: Axes, sheet: Sheet, models: list[str], values: list[float]) -> Non
     at = np.arange(len(models))[::-1]
     for y, m, value in zip(at, models, values, strict=True):
         ax.barh(y, value, 0.6, color=sheet.style(m).colour)
-        ax.text(value, y, f" {value:.2g}", va="center", fontsize=7.5, color=INK)
+        ax.text(value, y, f" {short(value)}", va="center", fontsize=7.5, color=INK)
     ax.set_yticks(at, models)
     ax.grid(axis="y", visible=False)
+    ax.margins(x=0.2)
     if values and max(values) > 30 * min(values):
         ax.set_xscale("log")
-    ax.margins(x=0.2)
+        ax.set_xlim(min(values) / 2, 4 * max(values))
+        few_log_ticks(ax.xaxis)
 
 
 def select(evaluation: Evaluation) -> Budgets | None:

@@ -66,7 +66,8 @@ class Coverage:
                         )  # fmt: skip
                     ax.margins(0.06)
                 if i == n - 1:
-                    ax.set_xlabel(span(self.names[j], units[j]))
+                    label = span(self.names[j], units[j])
+                    ax.set_xlabel(label.replace(" (", "\n(") if sheet.narrow else label)
                 else:
                     ax.tick_params(labelbottom=False)
                 if j == 0 and i > 0:
@@ -89,7 +90,7 @@ class Coverage:
         ranges = []
         for name, unit, column in zip(self.names, self.units, self.values.T, strict=True):
             values, shown = readable(column, unit)
-            ranges.append(f"{span(name, '')} {values.min():.4g} to {values.max():.4g} {shown}".strip())
+            ranges.append(f"{span(name, '')} {values.min():.3g} to {values.max():.3g} {shown}".strip())
         outside = 0
         if self.test.any() and (~self.test).any():
             train = self.values[~self.test]

@@ -52,11 +52,11 @@ class ErrorOverTime:
             ax.plot(self.time * MS, means[model] * CM, color=style.colour, linewidth=2.2)
             ax.set_title(f"{model}   {np.nanmean(means[model]) * CM:.2f} cm")
             ax.margins(x=0)
-            ax.set_ylim(bottom=0)
             if k % columns == 0 or sheet.narrow:
                 ax.set_ylabel("mean node error (cm)")
             if k >= count - columns or sheet.narrow:
                 ax.set_xlabel("time (ms)")
+        axes[0].set_ylim(0, 1.04 * CM * max(float(np.nanmax(errors)) for errors in self.errors.values()))
         return figure
 
     def caption(self) -> str:

@@ -13,6 +13,7 @@ from evaluation.figures.kind import Columns, Kind
 from evaluation.figures.style import CM, FAINT, INK, Sheet
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from evaluation.result import Evaluation
@@ -46,7 +47,7 @@ class Floors:
         return dict(zip(names, zip(*rows, strict=True), strict=True))
 
     def draw(self, sheet: Sheet) -> Figure:
-        figure, (left, right) = sheet.panels(2, height=6.8)
+        figure, (left, right) = sheet.panels(2, height=max(6.8, 2.6 + 0.62 * len(self.points)))
         modes = np.arange(1, len(self.floor) + 1)
         left.plot(modes, self.floor * CM, color=INK, linewidth=1.4, label="POD projection floor")
         left.fill_between(modes, self.floor * CM, color="#eeeeee", zorder=0)
@@ -68,33 +69,31 @@ class Floors:
         left.set_yticks(levels, [f"{t:g}" for t in levels])
         left.set_xlabel("numbers a state is reduced to")
         left.set_ylabel("mean node error (cm)")
-        left.legend(loc="best", fontsize=7.5)
         self._bars(right, sheet)
+        sheet.legend(figure, left)
         return figure
 
-    def _bars(self, ax: object, sheet: Sheet) -> None:
+    def _bars(self, ax: Axes, sheet: Sheet) -> None:
         labels = list(self.points)
         at = np.arange(len(labels))[::-1]
         for y, label in zip(at, labels, strict=True):
             p = self.points[label]
             colour = sheet.style(label).colour
-            ax.barh(y, p.total * CM, height=0.62, color=colour, alpha=0.35)  # type: ignore[attr-defined]
-            ax.barh(y, p.reduction * CM, height=0.62, color=colour)  # type: ignore[attr-defined]
+            ax.barh(y, p.total * CM, height=0.62, color=colour, alpha=0.35)
+            ax.barh(y, p.reduction * CM, height=0.62, color=colour)
             if len(p.seeds) > 1:
                 ends = (min(p.seeds) * CM, max(p.seeds) * CM)
-                ax.plot(ends, [y, y], color=INK, linewidth=1.2, marker="|", markersize=7)  # type: ignore[attr-defined]
+                ax.plot(ends, [y, y], color=INK, linewidth=1.2, marker="|", markersize=7)
             if p.lifting:
-                ax.plot(  # type: ignore[attr-defined]
-                    [p.lifting * CM] * 2, [y - 0.36, y + 0.36], color="black", linewidth=1.4
-                )
-            ax.text(  # type: ignore[attr-defined]
+                ax.plot([p.lifting * CM] * 2, [y - 0.36, y + 0.36], color="black", linewidth=1.4)
+            ax.text(
                 max(p.total, p.reduction, *p.seeds) * CM, y, f" {p.total * CM:.2f}", va="center", fontsize=8, color=INK
             )
-        ax.set_yticks(at, labels)  # type: ignore[attr-defined]
-        ax.grid(axis="y", visible=False)  # type: ignore[attr-defined]
-        ax.set_xlabel("mean node error (cm)")  # type: ignore[attr-defined]
-        ax.set_title("pale: all · full: reduction · bar: lifting", color=FAINT, fontweight="normal", fontsize=8)  # type: ignore[attr-defined]
-        ax.margins(x=0.14)  # type: ignore[attr-defined]
+        ax.set_yticks(at, labels)
+        ax.grid(axis="y", visible=False)
+        ax.set_xlabel("mean node error (cm)")
+        ax.set_title("pale: all · full: reduction · bar: lifting", color=FAINT, fontweight="normal", fontsize=8)
+        ax.margins(x=0.14)
 
     def caption(self) -> str:
         best = min(self.points, key=lambda label: self.points[label].total)

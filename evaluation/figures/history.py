@@ -61,7 +61,7 @@ class History:
     def caption(self) -> str:
         ends = {m: float(np.min(c["total"])) for m, c in self.curves.items() if "total" in c}
         order = sorted(ends, key=lambda m: ends[m])
-        said = ", ".join(f"{m} {ends[m]:.2e}" for m in order)
+        said = ", ".join(f"{m} {ends[m]:.2g}" for m in order)
         rising = [m for m in order if (total := self.curves[m]["total"]).size > 20 and _rises(total)]
         note = f" The total of {', '.join(rising)} rises again at its end." if rising else ""
         return (

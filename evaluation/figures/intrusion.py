@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.figures.kind import Columns, Kind
-from evaluation.figures.style import CM, FAINT, INK, MS, Sheet
+from evaluation.figures.style import CM, FAINT, INK, MS, Sheet, leading
 from evaluation.measures import masked_mean
 
 if TYPE_CHECKING:
@@ -18,16 +18,19 @@ if TYPE_CHECKING:
 
     from evaluation.result import Evaluation
 
+_SHOWN = 6
+
 
 @dataclass(frozen=True)
 class IntrusionFigure:
-    """truth (run, state) m and predictions: model -> (run, state) m, mean over seeds; about says of what."""
+    """truth (run, state) m and predictions: model -> (run, state) m, mean over seeds; about says of what; `shown` are drawn."""
 
     about: str
     runs: tuple[str, ...]
     time: NDArray[np.float64]
     truth: NDArray[np.float64]
     predictions: Mapping[str, NDArray[np.float64]]
+    shown: tuple[str, ...]
 
     def _largest(self) -> dict[str, NDArray[np.float64]]:
         return {m: np.nanmax(p, axis=1) for m, p in self.predictions.items()}
@@ -48,12 +51,13 @@ class IntrusionFigure:
     def draw(self, sheet: Sheet) -> Figure:
         figure, (scatter, history) = sheet.panels(2, height=7.0)
         true = np.nanmax(self.truth, axis=1) * CM
-        top = 1.06 * max(float(true.max()), *(float(p.max()) * CM for p in self._largest().values()))
+        predicted = {m: largest * CM for m, largest in self._largest().items() if m in self.shown}
+        top = 1.06 * max(float(true.max()), *(float(p.max()) for p in predicted.values()))
         scatter.plot([0, top], [0, top], color=FAINT, linewidth=0.9)
-        for model, largest in self._largest().items():
+        for model, largest in predicted.items():
             style = sheet.style(model)
             scatter.plot(
-                true, largest * CM, linestyle="none", marker=style.marker, color=style.colour, markersize=4.5,
+                true, largest, linestyle="none", marker=style.marker, color=style.colour, markersize=4.5,
                 alpha=0.85, markeredgewidth=0, label=model,
             )  # fmt: skip
         scatter.set_xlabel("true largest intrusion (cm)")
@@ -62,9 +66,11 @@ class IntrusionFigure:
         scatter.set_ylim(0, top)
         deepest = int(np.argmax(true))
         history.plot(self.time * MS, self.truth[deepest] * CM, color=INK, linewidth=2.2, label="truth")
-        for model, p in self.predictions.items():
+        for model in self.shown:
             style = sheet.style(model)
-            history.plot(self.time * MS, p[deepest] * CM, color=style.colour, linestyle=style.line)
+            history.plot(
+                self.time * MS, self.predictions[model][deepest] * CM, color=style.colour, linestyle=style.line
+            )
         history.set_title(f"{self.runs[deepest]}, black: truth")
         history.set_xlabel("time (ms)")
         history.set_ylabel("intrusion (cm)")
@@ -77,12 +83,13 @@ class IntrusionFigure:
         best, worst = min(misses, key=lambda m: misses[m]), max(misses, key=lambda m: misses[m])
         true = float(masked_mean(np.nanmax(self.truth, axis=1)))
         low = [m for m, p in self._largest().items() if (p < np.nanmax(self.truth, axis=1)).mean() > 0.75]
-        said = f" {', '.join(low)} underestimate it in more than three of four runs." if low else ""
+        said = f" Underestimated in more than three of four runs by {', '.join(low)}." if low else ""
         return (
             f"Largest intrusion of each test run ({self.about}), predicted against true; points below the line "
             f"are on the "
             f"unsafe side. Second: its history in the run with the deepest one. It is {true * CM:.1f} cm on average; "
             f"{best} misses it by {misses[best] * CM:.2f} cm, {worst} by {misses[worst] * CM:.2f} cm.{said}"
+            f"{leading(len(self.shown), len(self.predictions))}"
         )
 
 
@@ -98,6 +105,7 @@ def select(evaluation: Evaluation) -> IntrusionFigure | None:
         evaluation.reference.time,
         truth,
         {e.label: masked_mean(evaluation.scores[e.label].intrusion, axis=0) for e in evaluation.entries},
+        tuple(e.label for e in evaluation.leaders[:_SHOWN]),
     )
 
 

@@ -49,24 +49,25 @@ class ErrorOnLevels:
 
     def draw(self, sheet: Sheet) -> Figure:
         coarse = [level for level in self.nodes if level > 0]
-        figure, axes = sheet.panels(len(coarse), height=6.2, share_y=True)
+        on = {level: [m for m, own in self.own.items() if own in (0, level)] for level in coarse}
+        height = 2.4 + 0.8 * max(len(models) for models in on.values())
+        figure, axes = sheet.panels(len(coarse), height=height, share_x=True)
         for ax, level in zip(axes, sorted(coarse, reverse=True), strict=True):
-            models = [m for m, own in self.own.items() if own == level or own == 0]
-            for x, model in enumerate(models):
+            at = np.arange(len(on[level]))[::-1]
+            for y, model in zip(at, on[level], strict=True):
                 colour = sheet.style(model).colour
-                ax.bar(x - 0.2, self.reconstruction[model][level] * CM, 0.38, color=colour)
-                ax.bar(x + 0.2, self.approximation[model][level] * CM, 0.38, color=colour, alpha=0.4)
-                ax.text(
-                    x + 0.2, self.approximation[model][level] * CM, f"{self.approximation[model][level] * CM:.2f}",
-                    ha="center", va="bottom", fontsize=7, color=INK,
-                )  # fmt: skip
+                ends = [values[model][level] * CM for values in (self.reconstruction, self.approximation)]
+                for shift, end, opacity in ((0.19, ends[0], 1.0), (-0.19, ends[1], 0.4)):
+                    ax.barh(y + shift, end, 0.36, color=colour, alpha=opacity)
+                    ax.text(end, y + shift, f" {end:.2f}", va="center", fontsize=7, color=INK)
             floor = self.floor.get(level)
             if floor is not None:
-                ax.axhline(floor * CM, color=INK, linewidth=1, linestyle=":")
-            ax.set_xticks(range(len(models)), models, rotation=35, ha="right", rotation_mode="anchor")
+                ax.axvline(floor * CM, color=INK, linewidth=1, linestyle=":")
+            ax.set_yticks(at, on[level])
             ax.set_title(f"level {level}: {self.nodes[level]} nodes")
-            ax.grid(axis="x", visible=False)
-        axes[0].set_ylabel("mean node error (cm)")
+            ax.set_xlabel("mean node error (cm)")
+            ax.grid(axis="y", visible=False)
+            ax.margins(x=0.2)
         return figure
 
     def caption(self) -> str:

@@ -88,12 +88,11 @@ def select(evaluation: Evaluation) -> ErrorMap | None:
 
     if rendering_problem() is not None:
         return None
-    ranked = evaluation.ranked[:_SHOWN]
     return ErrorMap(
         evaluation.reference.position,
         evaluation.reference.faces,
         evaluation.reference.node_id,
-        {e.label: evaluation.scores[e.label].node_mean for e in ranked},
+        {e.label: evaluation.scores[e.label].node_mean for e in evaluation.leaders[:_SHOWN]},
     )
 
 

@@ -10,17 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.figures.kind import Columns, Kind
-from evaluation.figures.style import CM, FAINT, Sheet, readable, span
+from evaluation.figures.style import CM, FAINT, Sheet, leading, readable, span
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from evaluation.result import Evaluation
 
+_SHOWN = 6
+
 
 @dataclass(frozen=True)
 class ErrorOverParameters:
-    """values (run, parameter), errors: model -> (run,) m, ranges (parameter, 2) of the training runs."""
+    """values (run, parameter), errors: model -> (run,) m, ranges (parameter, 2) of the training runs; `shown` are drawn."""
 
     names: tuple[str, ...]
     units: tuple[str, ...]
@@ -28,6 +30,7 @@ class ErrorOverParameters:
     values: NDArray[np.float64]
     ranges: NDArray[np.float64]
     errors: Mapping[str, NDArray[np.float64]]
+    shown: tuple[str, ...]
 
     def numbers(self) -> Columns:
         columns: dict[str, list[object]] = {"run": list(self.runs)}
@@ -43,10 +46,10 @@ class ErrorOverParameters:
             values, unit = readable(self.values[:, k], self.units[k])
             ranges, _ = readable(np.append(self.ranges[k], np.abs(self.values[:, k]).max()), self.units[k])
             order = np.argsort(values)
-            for model, errors in self.errors.items():
+            for model in self.shown:
                 style = sheet.style(model)
                 ax.plot(
-                    values[order], errors[order] * CM, linestyle="none", marker=style.marker,
+                    values[order], self.errors[model][order] * CM, linestyle="none", marker=style.marker,
                     color=style.colour, markersize=4.5, alpha=0.85, label=model, markeredgewidth=0,
                 )  # fmt: skip
             for edge in ranges[:2]:
@@ -76,7 +79,7 @@ class ErrorOverParameters:
             f"Every point is a test run. Points high above the others mark a corner of the design space where "
             f"the model is "
             f"not to be trusted; dotted lines are the range of the training runs, and outside it nothing is "
-            f"known.{trend}"
+            f"known.{trend}{leading(len(self.shown), len(self.errors))}"
         )
 
 
@@ -101,6 +104,7 @@ def select(evaluation: Evaluation) -> ErrorOverParameters | None:
         reference.parameters[test],
         np.stack([seen.min(axis=0), seen.max(axis=0)], axis=1),
         {e.label: evaluation.scores[e.label].of_runs for e in evaluation.entries},
+        tuple(e.label for e in evaluation.leaders[:_SHOWN]),
     )
 
 

@@ -47,8 +47,8 @@ class FromFile:
         return (
             f"The last state of {self.path.name}, read back from the file: truth, prediction of {self.model} and "
             f"error. In "
-            f"ParaView, open the .pvd or the .vtkhdf file and warp by `displacement` or `predicted`; the arrays are "
-            f"{', '.join(arrays)}, in metres."
+            f"ParaView, open the .pvd or the .vtkhdf file and warp by displacement or predicted. Arrays: "
+            f"{', '.join(arrays)}; lengths in metres."
         )
 
 

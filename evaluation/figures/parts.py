@@ -43,7 +43,7 @@ class ErrorOfGroups:
 
     def draw(self, sheet: Sheet) -> Figure:
         order = self._order()
-        figure, (ax,) = sheet.panels(1, height=2.4 + 0.75 * len(order))
+        figure, (ax,) = sheet.panels(1, height=2.4 + max(0.75, 0.12 * len(self.errors)) * len(order))
         at = np.arange(len(order))[::-1]
         for k, (model, errors) in enumerate(self.errors.items()):
             style = sheet.style(model)

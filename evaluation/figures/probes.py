@@ -10,7 +10,7 @@ import numpy as np
 
 from evaluation.curves import Curve, curves, shown, unit
 from evaluation.figures.kind import Columns, Kind
-from evaluation.figures.style import INK, MS, Sheet, called
+from evaluation.figures.style import INK, MS, Sheet, called, leading
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,12 +22,14 @@ _SHOWN = 4
 
 @dataclass(frozen=True)
 class Probes:
-    """One run: truth and predictions as resultant curves (state, probe); nodes (probe,) the solver's numbers."""
+    """One run: truth and predictions as resultant curves (state, probe); nodes (probe,) the solver's numbers; `shown`
+    are drawn."""
 
     run: str
     nodes: tuple[int, ...]
     truth: Curve
     predictions: Mapping[str, Curve]
+    shown: tuple[str, ...]
 
     def numbers(self) -> Columns:
         rows = []
@@ -52,10 +54,10 @@ class Probes:
             quantity = quantities[q]
             times, values = self.truth.of(quantity)
             ax.plot(times * MS, shown(quantity, values[:, p]), color=INK, linewidth=2.2, label="truth")
-            for model, curve in list(self.predictions.items())[:_SHOWN]:
+            for model in self.shown:
                 style = sheet.style(model)
                 ax.plot(
-                    times * MS, shown(quantity, curve.of(quantity)[1][:, p]), color=style.colour,
+                    times * MS, shown(quantity, self.predictions[model].of(quantity)[1][:, p]), color=style.colour,
                     linestyle=style.line, linewidth=1.2, label=model,
                 )  # fmt: skip
             ax.set_ylabel(f"{quantity} ({unit(quantity)})")
@@ -75,13 +77,13 @@ class Probes:
             else "The states are too far apart, or too uneven, for any filter class of SAE J211, so velocities are "
             "plain differences and accelerations are left out."
         )
-        few = f" The {_SHOWN} most accurate models are drawn." if len(self.predictions) > _SHOWN else ""
         return (
             f"What sensors at {len(self.nodes)} nodes would have measured in {called(self.run)}, the median run of "
             f"the most "
             f"accurate model: resultant displacement, velocity and acceleration. {filtered} A surrogate that is "
             f"right in its "
-            f"mean displacement may still be of no use for accelerations; here it shows.{few}"
+            f"mean displacement may still be of no use for accelerations; here it shows."
+            f"{leading(len(self.shown), len(self.predictions))}"
         )
 
 
@@ -99,6 +101,7 @@ def select(evaluation: Evaluation) -> Probes | None:
         tuple(int(n) for n in evaluation.reference.node_id[evaluation.sensors.probes]),
         curves(time, watched.probes),
         {e.label: curves(time, evaluation.scores[e.label].probes[0, run]) for e in evaluation.ranked},
+        tuple(e.label for e in evaluation.leaders[:_SHOWN]),
     )
 
 

@@ -41,7 +41,7 @@ class RigidAndDeformation:
         return columns
 
     def draw(self, sheet: Sheet) -> Figure:
-        figure, (bars, over_time) = sheet.panels(2, height=6.4)
+        figure, (bars, over_time) = sheet.panels(2, height=max(6.4, 2.6 + 0.75 * len(self.rigid)))
         models = list(self.rigid)
         at = np.arange(len(models))[::-1]
         for y, model in zip(at, models, strict=True):
@@ -68,7 +68,7 @@ class RigidAndDeformation:
         over_time.set_ylabel("deformation error (cm)")
         over_time.margins(x=0)
         over_time.set_ylim(bottom=0)
-        over_time.legend(fontsize=7)
+        sheet.legend(figure, over_time)
         return figure
 
     def caption(self) -> str:

@@ -118,13 +118,12 @@ class Sheet:
             extra.remove()
         return figure, axes[:count]
 
-    def legend(self, figure: Figure, axes: Axes, columns: int | None = None) -> None:
-        """One legend for the whole figure, above its panels."""
+    def legend(self, figure: Figure, axes: Axes) -> None:
+        """One legend for the whole figure, above its panels, in as many columns as its longest label leaves room for."""
         handles, labels = axes.get_legend_handles_labels()
         if handles:
-            figure.legend(
-                handles, labels, loc="outside upper left", ncols=columns or min(len(labels), 3 if self.narrow else 6)
-            )
+            column = 1.5 + 0.17 * max(map(len, labels))  # cm: handle and gap, and eight points a letter
+            figure.legend(handles, labels, loc="outside upper left", ncols=max(1, int(self.width / column)))
 
 
 def look() -> Any:
@@ -156,9 +155,19 @@ def called(run: str) -> str:
     return run if run.lower().startswith("run") else f"run {run}"
 
 
+def leading(drawn: int, rows: int) -> str:
+    """What a caption adds where a figure draws the leading `drawn` of all `rows` (Evaluation.leaders)."""
+    return "" if drawn == rows else f" Drawn are the {drawn} most accurate models, each on its best level."
+
+
 def span(label: str, unit: str) -> str:
     """An axis label: what it is, and its unit where it has one."""
     return f"{label.replace('_', ' ')} ({unit})" if unit else label.replace("_", " ")
+
+
+def short(value: float) -> str:
+    """Two digits, for the end of a bar: 0.10, 3.1, 42, 310."""
+    return f"{value:#.2g}".rstrip(".") if abs(value) < 99.5 else f"{value:.0f}"
 
 
 def few_log_ticks(axis: Any) -> None:

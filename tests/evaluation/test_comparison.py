@@ -67,6 +67,16 @@ def test_seeds_can_be_kept_apart(models):
     assert [e.label for e in entries(seeds, seeds_as_spread=False)] == ["PODNN (podnn)", "PODNN (podnn-1)"]
 
 
+def test_rows_of_several_seeds_are_told_apart_by_their_folders_without_the_seed(models):
+    wide = {"model": "podnn", "width": 9}
+    seeds = [
+        replace(models[1], name=f"{name}-seed-{k}", seed=k, configuration=settings)
+        for name, settings in (("kart", models[1].configuration), ("wide", wide))
+        for k in range(2)
+    ]
+    assert [e.label for e in entries(seeds)] == ["PODNN (kart)", "PODNN (wide)"]
+
+
 def test_different_settings_are_no_seeds(models):
     other = replace(models[1], name="wide", seed=1, configuration={"model": "podnn", "width": 9})
     assert [e.label for e in entries((models[1], other))] == ["PODNN (podnn)", "PODNN (wide)"]

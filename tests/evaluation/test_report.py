@@ -18,7 +18,7 @@ from evaluation.figures import ORDER, drawings, kinds, sheet_of
 from evaluation.figures.kind import drawn, image
 from evaluation.figures.style import Sheet, readable, smoothed, styles
 from evaluation.files import write_run
-from evaluation.page import plain
+from evaluation.page import plain, show_table
 from evaluation.report import write_report
 from evaluation.result import compare
 
@@ -183,12 +183,41 @@ def test_units_people_read(values, unit, expected, shown):
         (0.0, "0"),
         (0.00213, "0.0021"),
         (1.2345, "1.23"),
+        (2.0, "2.00"),
+        (999.7, "1000"),
         (12345, "12\u2009345"),
         (7, "7"),
     ],
 )
 def test_numbers_people_read(value, text):
     assert plain(value) == text
+
+
+def test_columns_of_a_table_stand_in_units_people_read():
+    table = show_table("Runs", {"yield_stress (Pa)": [2.5e8], "peak_cm": [1.0], "note (old)": ["x"]})
+    assert [c.name for c in table.columns] == ["yield stress (MPa)", "peak (cm)", "note (old)"]
+    assert [cell.value for cell in table.rows[0]] == ["250", "1.00", "x"]
+
+
+def test_of_the_levels_of_a_cascade_the_best_alone_leads(evaluation):
+    assert sorted(e.label for e in evaluation.leaders) == sorted(
+        ["PODNN", "POD-GPR", min(("MH1", "MH2", "MH3"), key=lambda m: evaluation.scores[m].mean)]
+    )
+
+
+def test_no_run_leaves_the_panel_of_its_model(evaluation):
+    ((_, drawing),) = drawings(evaluation, ["error_over_time"])
+    for axes in drawn(drawing, sheet_of(evaluation)).axes:
+        assert axes.get_ylim()[1] >= max(line.get_ydata().max() for line in axes.lines)
+
+
+def test_a_legend_of_long_names_stays_within_the_figure(evaluation):
+    ((_, drawing),) = drawings(evaluation, ["floors"])
+    long = replace(drawing, points={f"{label} (a long folder name)": p for label, p in drawing.points.items()})
+    figure = drawn(long, Sheet(9.0))
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    assert legend.get_window_extent().x1 <= figure.bbox.x1
 
 
 def test_no_number_of_the_report_carries_a_stray_nan(report):

@@ -98,6 +98,33 @@ def test_the_interval_is_that_of_paired_differences():
     assert 0 < low < 0.1 < high < 0.2
 
 
+def test_an_advantage_that_another_seed_would_undo_is_none():
+    rng = np.random.default_rng(0)
+    runs = rng.uniform(1, 9, 40)
+    steady, lucky = np.stack([runs, runs]), np.stack([runs - 0.5, runs + 0.3])
+    assert difference(runs - 0.1, runs)[2] < 0
+    mean, low, high = difference(lucky, steady)
+    assert mean == pytest.approx(-0.1)
+    assert low < 0 < high
+
+
+def test_levels_of_one_cascade_share_their_seeds(evaluation):
+    keys = [((0, 0), (1, 0)), ((0, 1), (1, 1))]
+    rows = [replace(e, keys=k) for e, k in zip(evaluation.entries[:2], keys, strict=True)]
+    luck = np.array([[0.02], [0.05]])  # of the two seeds, the same on both levels
+    for row, offset in zip(rows, (0.0, 0.001), strict=True):
+        e2 = np.broadcast_to((luck + offset)[:, :, None], (2, 3, 5))
+        evaluation = replace(
+            evaluation, scores={**evaluation.scores, row.label: replace(evaluation.scores[row.label], e2=e2)}
+        )
+    assert clearly_better(evaluation, *rows)
+
+
+def test_a_model_trained_once_beside_others_with_seeds_is_named(evaluation):
+    rows = tuple(replace(e, keys=e.keys * 2) if e.level else e for e in evaluation.entries)
+    assert "without a spread: POD-GPR and PODNN." in _said(replace(evaluation, entries=rows), "One seed alone")[0].text
+
+
 def test_one_run_says_nothing_about_a_difference():
     assert difference(np.array([2.0]), np.array([1.0]))[1:] == (-np.inf, np.inf)
 
