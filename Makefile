@@ -11,7 +11,7 @@ DEMO   ?= demo
 demo: $(READY)
 	$(BIN)/crashkit demo -o $(DEMO)
 
-test: $(READY) check
+test: $(READY) check docs
 	$(BIN)/python -m pytest -n 2
 
 check: $(READY)
@@ -27,7 +27,7 @@ $(READY): pyproject.toml constraints.txt surrogates/_convolution.c
 	touch $@
 
 docs: $(READY)
-	$(BIN)/mkdocs build --quiet --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
 clean:
 	rm -rf $(VENV) $(DEMO) site

@@ -1,12 +1,17 @@
-"""Fills the schema tables of the documentation from the code, so that they cannot drift apart."""
+"""Fills tables of the documentation from the code and from results on file, so that they cannot drift apart."""
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import Any
+
+HERE = Path(__file__).parent
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Replace `<!-- schema: dimensions|variables|attributes -->` by tables."""
+    """Replace `<!-- schema: dimensions|variables|attributes -->` and `<!-- table: FILE -->` by tables."""
+    markdown = re.sub(r"<!-- table: (\S+) -->", lambda found: (HERE / found[1]).read_text(encoding="utf-8"), markdown)
     for name, make in (("dimensions", _dimensions), ("variables", _variables), ("attributes", _attributes)):
         marker = f"<!-- schema: {name} -->"
         if marker in markdown:
