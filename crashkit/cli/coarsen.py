@@ -40,14 +40,17 @@ def coarsen(
     if nodes is not None and ratios is not None:
         raise MeshError("both node counts and ratios were given; give one of them")
     mesh = open_mesh(Path(path))
-    hierarchy = build_hierarchy(
-        mesh.position,
-        mesh.face_nodes,
-        nodes if ratios is None else ratios_to_counts(len(mesh.position), ratios),
-        face_part=mesh.face_part,
-        selection=selection,
-        pair_distance=pair_distance,
-    )
+    try:
+        hierarchy = build_hierarchy(
+            mesh.position,
+            mesh.face_nodes,
+            nodes if ratios is None else ratios_to_counts(len(mesh.position), ratios),
+            face_part=mesh.face_part,
+            selection=selection,
+            pair_distance=pair_distance,
+        )
+    except MeshError as error:
+        raise MeshError(f"{path}: {error}") from error
     write_hierarchy(path, hierarchy, progress=report)
     return hierarchy
 

@@ -1,7 +1,7 @@
 """Meshes through VTK: surface, quadric selection, probe maps, hierarchy.
 
 Arrays in, arrays out; only `store` and `export` know files. The names below are imported when first used, because
-numba and VTK take their time.
+numba and VTK take their time. Functions that are called like their module, `surface` and `refine`, are imported from it.
 """
 
 from __future__ import annotations
@@ -18,9 +18,7 @@ _LAZY = {
     "level_displacement": "store",
     "lift": "lifting",
     "read_hierarchy": "store",
-    "refine": "refine",
     "summarize_hierarchy": "store",
-    "surface": "surface",
     "write_hierarchy": "store",
     "write_levels": "export",
 }

@@ -102,7 +102,7 @@ def test_counts_that_cannot_be_had_end_with_one_line_and_leave_the_dataset_alone
     code, out, err = run(path, *options)
     assert code == 1
     assert out == ""
-    assert err.splitlines()[-1].startswith("error: ")
+    assert err.splitlines()[-1].startswith(f"error: {path}: ")
     assert message in err.splitlines()[-1]
     assert path.read_bytes() == before
 

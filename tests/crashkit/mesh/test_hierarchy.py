@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from mesh_shapes import joined, kart, plate
 
+from crashkit import mesh
 from crashkit.errors import MeshError
 from crashkit.mesh import build_hierarchy, lift
 from crashkit.mesh.lifting import LiftingMeter
@@ -119,3 +120,9 @@ def test_lifting_keeps_the_precision_of_the_data() -> None:
     position, faces = plate(6, 6)
     level = build_hierarchy(position, faces, [12])[1]
     assert lift(level, np.ones((2, 12, 3), np.float32)).dtype == np.float32
+
+
+@pytest.mark.parametrize("name", mesh.__all__)
+def test_no_public_name_is_hidden_by_a_module(name: str) -> None:
+    getattr(mesh, name)  # imports the module behind it
+    assert callable(getattr(mesh, name))

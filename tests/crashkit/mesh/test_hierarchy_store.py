@@ -22,6 +22,8 @@ from crashkit.mesh import (
     write_hierarchy,
 )
 from crashkit.mesh.levels import Hierarchy
+from crashkit.mesh.refine import refine
+from crashkit.mesh.surface import surface
 
 
 def campaign(runs: int = 3) -> xr.Dataset:
@@ -245,3 +247,17 @@ def test_a_dataset_without_faces_is_refused(tmp_path: Path) -> None:
     write(campaign().drop_vars("face_nodes"), tmp_path / "points.nc")
     with pytest.raises(ReadError, match="holds no variable face_nodes"):
         store.open_mesh(tmp_path / "points.nc")
+
+
+def test_a_refined_hierarchy_is_stored_as_any_other(zarr_path: Path, hierarchy: Hierarchy) -> None:
+    position, faces, _ = kart()
+    error = np.linalg.norm(position - position[0], axis=1)
+    refined = refine(surface(position, faces), hierarchy, 2, error, nodes=60)
+    write_hierarchy(zarr_path, refined)
+    again = read_hierarchy(zarr_path)
+    assert [level.n_nodes for level in again.levels] == [60, hierarchy[2].n_nodes]
+    with xr.open_dataset(zarr_path, engine="zarr", consolidated=False) as dataset:
+        fine = dataset["displacement"].values
+    for level in again.levels:
+        assert (level_displacement(zarr_path, level.index) == fine[:, :, level.kept]).all()
+        assert np.abs(level.to_finer.sum(axis=1) - 1).max() <= 4 * np.finfo(float).eps
