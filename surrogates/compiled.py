@@ -118,11 +118,15 @@ def decode(
     elus: Sequence[bool],
     dense: tuple[Tensor, Tensor],
 ) -> Tensor:
-    """ELU(W z + b), then convolutions: (batch, latent) -> (node, batch, out), in memory channel by channel.
+    """ELU(W z + b), then convolutions: (batch, latent) -> (node, batch, out).
+
+    In memory channel by channel, as gradients want it; in predictions node by node, so that what follows moves whole
+    rows.
 
     dense    W (node * channel, latent) and b (node * channel); the others as in `encode`
     """
-    return _Decode.apply(z, operator, tuple(elus), *dense, *weights, *biases)
+    out = _Decode.apply(z, operator, tuple(elus), *dense, *weights, *biases)
+    return out if torch.is_grad_enabled() else out.transpose(1, 2).contiguous().transpose(1, 2)
 
 
 class _Encode(torch.autograd.Function):

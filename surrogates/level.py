@@ -106,7 +106,8 @@ class Level(nn.Module):
         own = self.reduction.decode(z)
         if self.coarse is None or self.upsampling is None:
             return own
-        return self.lifted(z) + own
+        lifted = self.lifted(z)
+        return lifted + own if torch.is_grad_enabled() else lifted.add_(own)
 
     def lifted(self, z: Tensor) -> Tensor:
         """Up(dec_l(z)): what the coarser level makes of z, on this level's nodes."""

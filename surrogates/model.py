@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import datetime
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
+from scipy import sparse
+from torch import Tensor
 
 from surrogates.config import Settings
 from surrogates.data import Campaign
@@ -97,6 +99,7 @@ class Surrogate:
         self.settings, self.record, self.graphs, self.core = settings, record, graphs, core
         self.points, self.faces = points, faces
         self.bands: dict[tuple[int, bool], Band] = {}
+        self._upward: dict[int, sparse.csr_matrix] = {}
 
     @property
     def level_names(self) -> dict[str, int]:
@@ -126,16 +129,26 @@ class Surrogate:
     ) -> NDArray[np.float32]:
         """`predict` lifted to the full mesh by the level's static U."""
         number = self.number(level)
-        return self.lift(self.predict(parameters, time, number), number)
+        values, times = self.checked(parameters, time)
+        if number == 0 or isinstance(self.core, PodRegression):
+            return self.lift(self.predict(parameters, times, number), number)
+        out = self._by_network(values, times, number, lambda states: self._lifted(states, number))
+        return out[0] if np.ndim(parameters) == 1 else out
 
     def lift(self, states: NDArray[np.float32], level: int) -> NDArray[np.float32]:
         """(..., node of `level`, 3) -> (..., node of the full mesh, 3)"""
         if level == 0:
             return states
-        up = self.graphs.to_full(level).astype(np.float32)
-        flat = np.moveaxis(states, -2, 0)
-        lifted = (up @ flat.reshape(len(flat), -1)).reshape(-1, *flat.shape[1:])
-        return np.moveaxis(lifted, 0, -2)
+        flat = torch.from_numpy(np.asarray(states, np.float32).reshape(-1, *states.shape[-2:]))
+        return self._lifted(flat.transpose(0, 1), level).numpy().reshape(*states.shape[:-2], -1, 3)
+
+    def _lifted(self, states: Tensor, level: int) -> Tensor:
+        """(node of `level`, b, 3) -> (b, node of the full mesh, 3), a view: transposing it costs more than lifting."""
+        by_channel = states.transpose(1, 2)  # predictions lie in memory this way
+        if level not in self._upward:
+            self._upward[level] = self.graphs.to_full(level).astype(np.float32)
+        rows = self._upward[level] @ by_channel.flatten(1).numpy()
+        return torch.from_numpy(rows).view(-1, *by_channel.shape[1:]).permute(2, 0, 1)
 
     def reconstruct(self, states: ArrayLike, level: int | None = None) -> NDArray[np.float32]:
         """Encode and decode displacements (state, node of `level`, 3), m: what the reduction alone costs."""
@@ -209,17 +222,22 @@ class Surrogate:
         return sum(kept.seconds for k, kept in self.record.fits.items() if k >= number)
 
     def _by_network(
-        self, parameters: NDArray[np.float64], time: NDArray[np.float64], number: int
+        self,
+        parameters: NDArray[np.float64],
+        time: NDArray[np.float64],
+        number: int,
+        end: Callable[[Tensor], Tensor] = lambda states: states.transpose(0, 1).contiguous(),
     ) -> NDArray[np.float32]:
+        """(batch, state, node, 3); `end` makes (b, node, 3) of states (node, b, 3)."""
         core = self.core
         at = torch.from_numpy(np.repeat(parameters, len(time), axis=0))
         when = torch.from_numpy(np.tile(time, len(parameters)))
         with torch.no_grad():
             parts = [
-                core(a, t, number).transpose(0, 1)  # type: ignore[operator]
+                end(core(a, t, number))  # type: ignore[operator]
                 for a, t in zip(at.split(_CHUNK), when.split(_CHUNK), strict=True)
             ]
-        out = (parts[0] if len(parts) == 1 else torch.cat(parts)).contiguous().numpy()
+        out = (parts[0] if len(parts) == 1 else torch.cat(parts)).numpy()
         return out.reshape(len(parameters), len(time), *out.shape[1:])
 
     def number(self, level: int | None = None) -> int:

@@ -59,10 +59,11 @@ class LatentProcess(nn.Module):
     def forward(self, inputs: Tensor) -> Tensor:
         weights = self._kernel(inputs[:, : self.runs.shape[1]])
         place, parts = self._stencil(inputs[:, self.runs.shape[1]])
+        courses = self.mean + (weights @ self.pull.flatten(1)).unflatten(1, self.mean.shape)
         out = torch.zeros_like(self.mean[:1])
         for k, part in enumerate(parts):
             at = (place + (k - 1)).clamp(0, len(self.time) - 1)
-            out = out + part[:, None] * (self.mean[at] + torch.einsum("br,rbz->bz", weights, self.pull[:, at]))
+            out = out + part[:, None] * courses.gather(1, at[:, None, None].expand(-1, 1, out.shape[1])).squeeze(1)
         return out
 
     def _kernel(self, x: Tensor) -> Tensor:

@@ -122,6 +122,14 @@ class LinearReduction(Reduction):
     def decode(self, z: Tensor) -> Tensor:
         return unflat(torch.addmm(self.offset, z, self.decode_matrix.t()), self.n_nodes)
 
+    def added(self, x: Tensor, z: Tensor) -> Tensor:
+        """x + decode(z), in place where x lies node by node in memory, channel by channel within a node."""
+        by_channel = x.transpose(1, 2)
+        if not by_channel.is_contiguous():
+            return x + self.decode(z)
+        by_channel.flatten(0, 1).addmm_(self.decode_matrix, z.t()).add_(self.offset[:, None])
+        return x
+
     def decode_only(self) -> None:
         del self.encode_matrix
 
@@ -139,7 +147,8 @@ class SumReduction(Reduction):
         return self.linear.encode(x) + self.remainder.encode(x)
 
     def decode(self, z: Tensor) -> Tensor:
-        return self.linear.decode(z) + self.remainder.decode(z)
+        nonlinear = self.remainder.decode(z)
+        return self.linear.decode(z) + nonlinear if torch.is_grad_enabled() else self.linear.added(nonlinear, z)
 
     def decode_only(self) -> None:
         self.linear.decode_only()

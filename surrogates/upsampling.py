@@ -39,8 +39,13 @@ class Upsampling(nn.Module):
         self.bias = nn.Parameter(torch.zeros(csr.shape[0]), requires_grad=trains)
 
     def forward(self, x: Tensor) -> Tensor:
-        n, batch, channels = x.shape
-        rows = x.reshape(n, batch * channels)
+        by_channel = x.transpose(1, 2)
+        if not torch.is_grad_enabled() and by_channel.is_contiguous():  # spares predictions a copy
+            return self._of_rows(by_channel.flatten(1)).view(-1, *by_channel.shape[1:]).transpose(1, 2)
+        return self._of_rows(x.flatten(1)).view(-1, *x.shape[1:])
+
+    def _of_rows(self, rows: Tensor) -> Tensor:
+        """W x + b for x (coarse node, any)."""
         if self.kind == "linear":
             out = torch.addmm(self.bias[:, None], self.weight, rows)
         else:
@@ -49,7 +54,7 @@ class Upsampling(nn.Module):
                 out = torch.addcmul(out, self.weight[:, k : k + 1], rows[self.columns[:, k]])
             if self.kind == "sparse":
                 out = out + self.bias[:, None]
-        return out.view(-1, batch, channels)
+        return out
 
     def as_matrix(self) -> Tensor:
         """W (finer node, coarse node), dense."""
