@@ -24,8 +24,14 @@ _QUANTITIES = MappingProxyType(
         "force": ((1, -2, 1), "N"),
         "stress": ((-1, -2, 1), "Pa"),
         "energy": ((2, -2, 1), "J"),
+        "specific energy": ((2, -2, 0), "J kg-1"),
+        "power": ((2, -3, 1), "W"),
+        "moment": ((2, -2, 1), "N m"),
+        "area": ((2, 0, 0), "m2"),
+        "volume": ((3, 0, 0), "m3"),
         "density": ((-3, 0, 1), "kg m-3"),
         "one/time": ((0, -1, 0), "s-1"),
+        "one/time2": ((0, -2, 0), "s-2"),
         "one": ((0, 0, 0), "1"),
     }
 )
@@ -86,12 +92,15 @@ def to_si(unit: str) -> tuple[float, str]:
     surrogate, and its label must be the one its owner reads.
     """
     known = {
-        "mm": (1e-3, "m"), "cm": (1e-2, "m"), "m": (1.0, "m"),
-        "ms": (1e-3, "s"), "s": (1.0, "s"),
+        "mm": (1e-3, "m"), "cm": (1e-2, "m"), "m": (1.0, "m"), "in": (0.0254, "m"),
+        "us": (1e-6, "s"), "ms": (1e-3, "s"), "s": (1.0, "s"),
         "g": (1e-3, "kg"), "t": (1e3, "kg"), "kg": (1.0, "kg"),
         "MPa": (1e6, "Pa"), "GPa": (1e9, "Pa"), "kPa": (1e3, "Pa"), "Pa": (1.0, "Pa"),
         "N/mm2": (1e6, "Pa"), "N/mm^2": (1e6, "Pa"),
-        "km/h": (1 / 3.6, "m s-1"), "mm/ms": (1.0, "m s-1"), "m/s": (1.0, "m s-1"), "m s-1": (1.0, "m s-1"),
+        "km/h": (1 / 3.6, "m s-1"), "mph": (0.44704, "m s-1"), "mm/s": (1e-3, "m s-1"), "mm/ms": (1.0, "m s-1"),
+        "m/s": (1.0, "m s-1"), "m s-1": (1.0, "m s-1"),
+        "N": (1.0, "N"), "kN": (1e3, "N"), "J": (1.0, "J"), "kJ": (1e3, "J"),
+        "kg/m3": (1.0, "kg m-3"), "kg m-3": (1.0, "kg m-3"), "g/cm3": (1e3, "kg m-3"), "t/mm3": (1e12, "kg m-3"),
         "deg": (1.0, "degree"), "°": (1.0, "degree"), "degree": (1.0, "degree"),
         "": (1.0, "1"), "-": (1.0, "1"), "1": (1.0, "1"),
     }  # fmt: skip

@@ -4,34 +4,43 @@ from __future__ import annotations
 
 import re
 
-# What a field measures, for the change to SI. A name that is not here keeps its own name as its quantity, so that
-# asking for it in another unit system than SI ends in a clear message and never in a wrong unit.
+# What a field measures, for the change to SI. A name that is not here keeps its own name as its quantity, so that its
+# values stay as they are, labelled "unknown". Temperature is left out on purpose: no source says whether it is in
+# kelvin or in degrees.
 _QUANTITIES = {
     "acceleration": "acceleration",
-    "axial_force": "force",
-    "contact_force": "force",
+    "angular_acceleration": "one/time2",
+    "angular_velocity": "one/time",
+    "area": "area",
     "contact_forces": "force",
+    "damage": "one",
     "density": "density",
-    "effective_strain": "one",
     "energy": "energy",
-    "force": "force",
-    "internal_energy": "energy",
-    "internal_forces": "force",
+    "energy_density": "stress",
     "external_forces": "force",
+    "force": "force",
+    "internal_forces": "force",
     "mass": "mass",
-    "nodal_mass": "mass",
     "mass_change": "one",
-    "plastic_strain": "one",
+    "moment": "moment",
+    "power": "power",
     "pressure": "stress",
-    "shear_force": "force",
+    "rotational_acceleration": "one/time2",
+    "rotational_velocity": "one/time",
+    "sound_speed": "velocity",
+    "specific_energy": "specific energy",
     "strain": "one",
     "strain_rate": "one/time",
     "stress": "stress",
     "thickness": "length",
     "time_step": "time",
+    "triaxiality": "one",
     "velocity": "velocity",
+    "volume": "volume",
     "von_mises": "stress",
 }
+# Behind a known word these make something else of it: the gradient of a stress is no stress.
+_CHANGING = {"density", "factor", "flux", "gradient", "index", "rate", "ratio"}
 _SAME = {
     "eps": "plastic_strain",
     "epsp": "plastic_strain",
@@ -59,13 +68,19 @@ def field_name(title: str) -> str:
 
 
 def quantity(name: str) -> str:
-    """The quantity of the field `name`, by its longest known beginning or end ("stress_upper" is a stress).
+    """The quantity of the field `name`, told by its last words that are known; `name` itself where none is.
 
-    Solids, beams and the like carry their kind in front ("solid_plastic_strain"), surfaces and layers behind.
+    Solids, beams and the like carry their kind in front ("solid_plastic_strain"), surfaces and layers behind
+    ("stress_upper"), and what comes last says what it is: a "plastic_strain_rate" is a rate.
     """
-    if name in _QUANTITIES:
-        return _QUANTITIES[name]
-    for known in sorted(_QUANTITIES, key=len, reverse=True):
-        if name.startswith(known + "_") or name.endswith("_" + known):
-            return _QUANTITIES[known]
+    words = name.split("_")
+    if "per" in words:
+        return name
+    for end in range(len(words), 0, -1):
+        for begin in range(end):
+            known = _QUANTITIES.get("_".join(words[begin:end]))
+            if known is not None:
+                return known
+        if words[end - 1] in _CHANGING:
+            break
     return name
