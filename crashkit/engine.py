@@ -28,7 +28,7 @@ from crashkit.readers.base import Run, Runs
 from crashkit.run_view import RunView, gone_nodes
 from crashkit.store import SUFFIXES
 from crashkit.structure import structure_of
-from crashkit.survey import wanted_field
+from crashkit.survey import reader_options, wanted_field
 from data_schema import CONVENTIONS, to_si, unit_system
 
 
@@ -37,7 +37,8 @@ class CrashBackend(BackendEntrypoint):
 
     description = "Crash datasets, and results of LS-DYNA, OpenRadioss and the like, read lazily"
     open_dataset_parameters = (
-        "filename_or_obj", "drop_variables", "run", "units", "reader", "mesh", "parts", "exclude_parts", "keep_rigid_walls",
+        "filename_or_obj", "drop_variables", "run", "units", "reader", "mesh", "time_step", "parts", "exclude_parts",
+        "keep_rigid_walls",
     )  # fmt: skip
 
     def open_dataset(  # type: ignore[override]
@@ -49,6 +50,7 @@ class CrashBackend(BackendEntrypoint):
         units: str | None = None,
         reader: str | None = None,
         mesh: str | Path | None = None,
+        time_step: float | None = None,
         parts: Sequence[str] = (),
         exclude_parts: Sequence[str] = (),
         keep_rigid_walls: bool = False,
@@ -65,8 +67,8 @@ class CrashBackend(BackendEntrypoint):
         if path.suffix in SUFFIXES and reader is None:
             dataset = open_dataset(path, chunks=None)
         else:
-            options = {"mesh": str(mesh)} if mesh is not None else {}
-            opened = _the_run(path, run, reader_for(path, reader).runs(path, **options))
+            options = reader_options(mesh, time_step)
+            opened = _the_run(path, run, reader_for(path, reader).runs(path, **dict(options)))
             dataset = dataset_of(opened, units, parts, exclude_parts, keep_rigid_walls)
         drop = [drop_variables] if isinstance(drop_variables, str) else list(drop_variables or ())
         kept = dataset.drop_vars(drop, errors="ignore")

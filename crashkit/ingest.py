@@ -26,7 +26,7 @@ from crashkit.errors import CrashkitError, DataError, OutputError, ReadError
 from crashkit.staging import BackgroundHashes, StagedRun, Staging, key_of
 from crashkit.store import check_output, recover
 from crashkit.structure import Structure
-from crashkit.survey import Choice, Found, Survey, described, survey
+from crashkit.survey import Choice, Found, Survey, described, reader_options, survey
 from crashkit.transfer import Layout, is_whole, let_memory_go, transfer
 
 Progress = Callable[[int, int, str], None]
@@ -65,6 +65,7 @@ def ingest(
     units: str | None = None,
     reader: str | None = None,
     mesh: str | Path | None = None,
+    time_step: float | None = None,
     names: str = "{run}",
     parts: Sequence[str] = (),
     exclude_parts: Sequence[str] = (),
@@ -83,6 +84,7 @@ def ingest(
     params            table of design parameters (`crashkit.parameter_table`), before those of the source
     units             unit system of the source, e.g. "mm-ms-kg"; needed where the source states none
     reader, mesh      source format by name; file with the faces where the source has none
+    time_step         time between two states, in the source's unit, where the source holds no times
     names             how runs are called: text with {run} and {source}, such as "{source}-{run}"
     parts             only these parts (number, title or glob); exclude_parts: without these
     keep_rigid_walls  keep what the solver drew of rigid walls
@@ -112,7 +114,7 @@ def ingest(
     choice = Choice(
         units=units, parts=tuple(parts), exclude_parts=tuple(exclude_parts), keep_rigid_walls=keep_rigid_walls,
         fields=tuple(dict.fromkeys(fields)), allow_incomplete=allow_incomplete, names=names, reader=reader,
-        reader_options=(("mesh", str(mesh)),) if mesh is not None else (),
+        reader_options=reader_options(mesh, time_step),
     )  # fmt: skip
     with Staging(output) as staging, _what_is_kept(staging):
         recover(staging.folder, output)
@@ -261,12 +263,15 @@ class _Job:
         structure = old.structure if old is not None else look.structure
         if structure is None:
             raise DataError("no run can be used")
-        whole = [f.time for f in fresh if f.complete] or [f.time for f in fresh]
+        whole = [f for f in fresh if f.complete] or fresh
+        time = old.time if old is not None else common_time([f.time for f in whole], self.wanted)
+        if old is None and self.wanted is None:
+            _note_lost_end(time, whole, look)
         wanted = {n: next(f.fields[n] for f in look.found if n in f.fields) for n in self.choice.fields}
         return Layout(
             choice=self.choice,
             structure=structure,
-            time=old.time if old is not None else common_time(whole, self.wanted),
+            time=time,
             fields=wanted,
             one_shape=look.one_shape and (old is None or old.one_shape),
         )
@@ -406,6 +411,18 @@ def _key(found: Found, layout: Layout) -> str:
             "one_shape": layout.one_shape,
         }
     )
+
+
+def _note_lost_end(time: NDArray[np.float64], runs: Sequence[Found], look: Survey) -> None:
+    """Say so where the common times end a state or more before some run does."""
+    step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    longest = max(runs, key=lambda f: float(f.time[-1]))
+    if float(longest.time[-1]) - time[-1] > 0.5 * step:
+        shortest = min(runs, key=lambda f: float(f.time[-1]))
+        look.note(
+            f"the common times end at {time[-1]:g} s, since run {shortest.name} ends at {shortest.time[-1]:g} s; run "
+            f"{longest.name} goes on to {longest.time[-1]:g} s"
+        )
 
 
 def _hash(values: NDArray[Any]) -> str:

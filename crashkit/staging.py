@@ -17,7 +17,7 @@ import os
 import shutil
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -37,7 +37,6 @@ class StagedRun:
     name: str
     digests: Mapping[str, str]
     error: float
-    notes: tuple[str, ...] = field(default=())
 
 
 class Staging:
@@ -70,7 +69,7 @@ class Staging:
             if "file" in line:
                 self.hashes[(line["file"], line["bytes"], line["changed"])] = line["sha256"]
             else:
-                self.runs[line["key"]] = StagedRun(**{**line, "notes": tuple(line["notes"])})
+                self.runs[line["key"]] = StagedRun(line["key"], line["name"], line["digests"], line["error"])
         return self
 
     def __exit__(

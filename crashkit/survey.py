@@ -187,6 +187,12 @@ def each_run(source: Path, choice: Choice, out: Survey, stop: bool) -> Iterator[
         yield index, _named(run.name, source, choice.names), run
 
 
+def reader_options(mesh: str | Path | None, time_step: float | None) -> tuple[tuple[str, str], ...]:
+    """What a reader is told beside the path, without what is not given; it refuses what it has no use for."""
+    given = {"mesh": mesh, "time_step": time_step}
+    return tuple((name, str(value)) for name, value in given.items() if value is not None)
+
+
 def reopen(found: Found, choice: Choice) -> Run:
     """The run `found`, opened again where it was found."""
     runs = reader_for(found.source, choice.reader).runs(found.source, **dict(choice.reader_options))
@@ -273,6 +279,9 @@ def _look(run: Run, name: str, source: Path, index: int, choice: Choice, out: Su
         size = float(np.ptp(out.structure.position, axis=0).max(initial=0.0))
         out.one_shape &= bool(np.abs(structure.position - out.structure.position).max(initial=0.0) <= SAME_SHAPE * size)
     fields = {n: f for n in choice.fields if (f := wanted_field(run, n, units)) is not None}
+    for field_name, wanted in fields.items():
+        if wanted.unit == "unknown":
+            out.note(f"field {field_name}: no source says its unit; the values stay as they are, labelled unknown")
     missing = [n for n in choice.fields if n not in fields]
     if missing:
         out.note(f"run {name} has no {', '.join(missing)}; it has {', '.join(run.fields) or 'no further field'}")

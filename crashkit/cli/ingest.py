@@ -22,6 +22,12 @@ def command(
     units: Annotated[str | None, typer.Option(help="Unit system of the source: SI, mm-ms-kg, mm-s-t, ...")] = None,
     reader: Annotated[str | None, typer.Option(help="Source format, where it shall not be told by content.")] = None,
     mesh: Annotated[Path | None, typer.Option(help="Mesh file with the faces, where the source has none.")] = None,
+    time_step: Annotated[
+        float | None,
+        typer.Option(
+            help="Time between two states, in the source's unit, where the source has none.", show_default=False
+        ),
+    ] = None,
     names: Annotated[
         str, typer.Option(help="Names of the runs, from {run} and {source}, such as {source}-{run}.")
     ] = "{run}",
@@ -69,7 +75,7 @@ def command(
 
         try:
             summary = ingest(
-                sources, output, params=params, units=units, reader=reader, mesh=mesh, names=names,
+                sources, output, params=params, units=units, reader=reader, mesh=mesh, time_step=time_step, names=names,
                 parts=_list(parts), exclude_parts=_list(exclude_parts), keep_rigid_walls=keep_rigid_walls,
                 fields=_list(fields), time=_times(time), on_error="skip" if on_error == "skip" else "stop",
                 allow_incomplete=allow_incomplete, overwrite=overwrite, workers=workers, scheduler=scheduler,

@@ -59,7 +59,7 @@ class MeshioSeries:
             time_step = float(str(step))
         except ValueError:
             raise CrashkitError(
-                f"{path}: its files hold no times; give the time between two of them (time_step), found {step!r}"
+                f"{path}: its files hold no times; give the time between two of them (--time-step), found {step!r}"
             ) from None
         return Runs({name: partial(_open_files, name, files, time_step) for name, files in families.items()})
 

@@ -60,7 +60,7 @@ class PhysicsNemo:
         try:
             step = None if step is None else float(str(step))
         except ValueError:
-            raise CrashkitError(f"option time_step is {step!r}, expected the time between two states") from None
+            raise CrashkitError(f"--time-step is {step!r}; expected the time between two states") from None
         found = _found(path)
         if not found:
             raise ReadError(
@@ -104,7 +104,9 @@ def _open(name: str, path: Path, mesh: Path | None, step: float | None) -> Run:
 
 def _times(count: int, step: float | None, path: Path) -> NDArray[np.float64]:
     if step is None:
-        raise ReadError(f"{path}: tells no times of its {count} states; give the time between two of them (time_step)")
+        raise ReadError(
+            f"{path}: tells no times of its {count} states; give the time between two of them (--time-step)"
+        )
     return np.arange(count, dtype=np.float64) * step
 
 

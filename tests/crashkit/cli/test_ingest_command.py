@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import h5py
+import meshio
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -68,6 +69,20 @@ def test_ingest_at_given_times_tells_the_error(tmp_path: Path) -> None:
     assert code == 0
     assert "estimated error (mm)" in out
     assert "4 states" in told
+
+
+def test_ingest_of_files_without_times_takes_a_time_step(tmp_path: Path) -> None:
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    (tmp_path / "runs").mkdir()
+    for state in range(3):
+        mesh = meshio.Mesh(corners + 0.1 * state, [("triangle", np.array([[0, 1, 2]]))])
+        mesh.write(tmp_path / "runs" / f"plate_{state}.ply")
+    asked = ("ingest", tmp_path / "runs", "-o", tmp_path / "crash.nc", "--reader", "meshio", "--units", "mm-ms-kg")
+    code, _, told = run(*asked)
+    assert code == 1
+    assert "(--time-step)" in told
+    assert run(*asked, "--time-step", "0.5")[0] == 0
+    np.testing.assert_allclose(open_dataset(tmp_path / "crash.nc").time, [0, 0.0005, 0.001])
 
 
 def test_ingest_skips_and_says_why(tmp_path: Path) -> None:

@@ -98,7 +98,7 @@ def test_numbered_files_of_other_formats_are_read_by_name(tmp_path, only_run, sa
 def test_numbered_files_need_a_time_step(tmp_path, sample):
     for state in range(2):
         meshio.Mesh(sample.points, [("triangle", sample.faces)]).write(tmp_path / f"kart_{state}.ply")
-    with pytest.raises(CrashkitError, match=r"hold no times; give the time between two of them \(time_step\)"):
+    with pytest.raises(CrashkitError, match=r"hold no times; give the time between two of them \(--time-step\)"):
         reader_for(tmp_path, "meshio").runs(tmp_path)
 
 

@@ -58,7 +58,7 @@ def test_positions_called_displacements_are_read_as_positions(tmp_path, only_run
 
 def test_numbered_states_need_a_time_step(tmp_path, only_run, sample):
     file = write_vtp(tmp_path / "run.vtp", sample, sample.displacement, "t{state:03d}")
-    with pytest.raises(ReadError, match=r"tells no times of its 3 states.*time_step"):
+    with pytest.raises(ReadError, match=r"tells no times of its 3 states.*--time-step"):
         only_run(file)
     assert only_run(file, time_step="0.01").time.tolist() == [0, 0.01, 0.02]
 
@@ -123,5 +123,5 @@ def test_a_truncated_vtp_is_refused(tmp_path, sample):
 
 
 def test_a_time_step_must_be_a_number(tmp_path):
-    with pytest.raises(CrashkitError, match="time_step is 'soon'"):
+    with pytest.raises(CrashkitError, match="--time-step is 'soon'"):
         reader_for(tmp_path, "physicsnemo").runs(tmp_path, time_step="soon")
