@@ -1,10 +1,12 @@
 """Damaged solver results against ingest: cut at random places, and single bits flipped at random places.
 
-    python benchmarks/damage.py --data FOLDER [--each 200] [--seed 0] [--workers 2] [--case SET/MODE/NUMBER]
+    python benchmarks/damage.py [--data FOLDER] [--each 200] [--seed 0] [--workers 2] [--quick] [--json FILE]
+                                [--case SET/MODE/NUMBER]
 
-Every folder of d3plot or OpenRadioss files under FOLDER is damaged `--each` times in each way, one file and one
-place at a time, and given to `crashkit.ingest.ingest` with all its fields; what comes out is opened and validated.
-Sets that are incomplete as they are, are read with `allow_incomplete`, else nothing would be tried on them. The counts:
+Every folder of d3plot or OpenRadioss files under FOLDER (without: the small ones of the tests) is damaged `--each`
+times in each way, one file and one place at a time, and given to `crashkit.ingest.ingest` with all its fields; what
+comes out is opened and validated. Sets that are incomplete as they are, are read with `allow_incomplete`, else nothing
+would be tried on them. `--quick` takes a few places. `--json` writes the share of the cases that must not be. The counts:
 
     refused     an error that names what is wrong, with nothing written; or a dataset that `validate` finds fault with
     identical   a dataset equal to that of the undamaged files: padding, or something nobody reads, was hit
@@ -36,6 +38,8 @@ from pathlib import Path
 from typing import Any
 
 PATIENCE = 60.0
+SHIPPED = Path(__file__).resolve().parents[1] / "tests" / "data"
+QUICK = 5
 OUTCOMES = ("refused", "identical", "other value", "states lost", "traceback", "crash", "hang")
 FORBIDDEN = OUTCOMES[3:]
 MODES = ("cut", "bit")
@@ -225,8 +229,12 @@ def work(todo: queue.SimpleQueue[tuple[Case, dict[str, Any]]], done: list[tuple[
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, help="folder with d3plot and OpenRadioss results, at any depth")
+    parser.add_argument(
+        "--data", type=Path, default=SHIPPED, help="folder with d3plot and OpenRadioss results, at any depth"
+    )
     parser.add_argument("--each", type=int, default=200, help="cases for each set and way of damage (default 200)")
+    parser.add_argument("--quick", action="store_true", help=f"{QUICK} cases for each set and way of damage")
+    parser.add_argument("--json", type=Path, help="file for the share of cases that must not be")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2, help="child processes (default 2)")
     parser.add_argument("--case", help="run this one case, SET/MODE/NUMBER, and tell what came out")
@@ -235,8 +243,6 @@ def main() -> int:
     if arguments.serve:
         serve()
         return 0
-    if arguments.data is None:
-        parser.error("--data is needed")
     sets = result_sets(arguments.data.resolve())
     if not sets:
         parser.error(f"no d3plot or OpenRadioss results under {arguments.data}")
@@ -248,7 +254,7 @@ def main() -> int:
         states = f"{whole['reference']['states']} states" if "reference" in whole else "no dataset"
         print(f"{folder.name}: {states}" + (f" ({whole['text']})" if "text" in whole else ""))
         for mode in MODES:
-            for case in cases(folder, mode, arguments.each, arguments.seed):
+            for case in cases(folder, mode, QUICK if arguments.quick else arguments.each, arguments.seed):
                 if arguments.case in (None, case.name):
                     # A set that cannot be read undamaged must not be read damaged either: any state is one too few.
                     undamaged = whole.get("reference", {"states": sys.maxsize, "sums": {}})
@@ -273,7 +279,18 @@ def main() -> int:
         print(
             f"{case.name}: {answer['outcome']}: {case.file}, byte {case.place}, bit {case.bit}: {answer.get('text', '')}"
         )
-    return int(any(counts[key] for key in counts if key[2] in FORBIDDEN))
+    bad = sum(answer["outcome"] in FORBIDDEN for _, answer in done)
+    if arguments.json:
+        seen = Counter(answer["outcome"] for _, answer in done)
+        entry = {
+            "what": "damaged results: share of cases with lost states, traceback, crash or hang",
+            "ratio": bad / max(1, len(done)),
+            "goal": 0.0,
+            "sense": "at most",
+            "note": f"{len(done)} cases on {len(sets)} sets: " + ", ".join(f"{n} {name}" for name, n in seen.items()),
+        }
+        arguments.json.write_text(json.dumps([entry], indent=1))
+    return int(bad > 0)
 
 
 if __name__ == "__main__":
