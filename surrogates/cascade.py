@@ -71,9 +71,7 @@ def build_level(number: int, settings: Settings, graphs: Graphs, cascade: Cascad
     concat = settings.transfer.encoder == "concat" and coarse is not None
     below = 0 if coarse is None else coarse.latent
     latent = own.latent + (below if concat else 0)
-    needs_graph = own.reduction == "gcn"
-    edges = graphs.edges(number) if needs_graph else None
-    reduction = make_reduction(own, edges, graphs.n_nodes(number), latent)
+    reduction = make_reduction(own, graphs.edges(number), graphs.n_nodes(number), latent)
     extra = latent if settings.inputs.initial_state else 0
     regressor = Regressor(
         cascade.inputs.size + extra, latent, own.mlp.widths, own.mlp.activation,

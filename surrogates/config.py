@@ -22,6 +22,9 @@ Preset = Literal["fast", "paper"]
 MODELS: tuple[Model, ...] = ("mh", "podnn", "aenn", "gaenn", "pod-gpr", "pod-rbf")
 PRESETS: tuple[Preset, ...] = ("fast", "paper")
 
+# Names of reductions; `surrogates.reduction.register` adds to them.
+REDUCTIONS = ["gcn", "ae", "pod"]
+
 Positive = Annotated[int, Field(ge=1)]
 
 
@@ -39,7 +42,8 @@ class MlpSettings(_Frozen):
 class LevelSettings(_Frozen):
     """One level: its reduction, its regression and how both are trained.
 
-    reduction      gcn: graph convolutions and a dense layer; ae: fully connected; pod: linear, computed, not trained
+    reduction      gcn: graph convolutions and a dense layer; ae: fully connected; pod: linear, computed, not trained; or
+                   the name of a registered one
     convolution    of gcn: Chebyshev (cheb), first order (gcn) or with initial residual (gcn2)
     channels       of gcn, behind the three coordinates
     order          Chebyshev terms
@@ -50,7 +54,7 @@ class LevelSettings(_Frozen):
     start          pod: reduction gcn or ae beside a trainable linear part that starts at POD, its own end at zero
     """
 
-    reduction: Literal["gcn", "ae", "pod"] = "gcn"
+    reduction: str = "gcn"
     convolution: Literal["cheb", "gcn", "gcn2"] = "cheb"
     latent: Positive = 4
     channels: tuple[Positive, ...] = (6, 12, 24)
@@ -70,6 +74,14 @@ class LevelSettings(_Frozen):
     rate_inputs: Annotated[int, Field(ge=0)] = 0
     weight_approximation: Annotated[float, Field(ge=0)] = 1.0
     weight_reconstruction: Annotated[float, Field(ge=0)] = 1.0
+
+    @field_validator("reduction")
+    @classmethod
+    def _known(cls, value: str) -> str:
+        if value not in REDUCTIONS:
+            *most, last = (f"'{name}'" for name in REDUCTIONS)
+            raise ValueError(f"found {value!r}; expected {', '.join(most)} or {last}")
+        return value
 
     @field_validator("channels")
     @classmethod

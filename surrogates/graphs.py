@@ -41,13 +41,9 @@ class Graphs:
     def n_nodes(self, number: int) -> int:
         return self.n_full if number == 0 else self[number].n_nodes
 
-    def edges(self, number: int) -> NDArray[np.int32]:
-        """(e, 2)"""
-        if number:
-            return self[number].edges
-        if self.full_edges is None:
-            raise SurrogateError("graph convolutions on the full mesh need its edges; the data has none")
-        return self.full_edges
+    def edges(self, number: int) -> NDArray[np.int32] | None:
+        """(e, 2); None on the full mesh where the data has none."""
+        return self[number].edges if number else self.full_edges
 
     def kept(self, number: int) -> NDArray[np.int64]:
         """Nodes of the level as nodes of level 0."""

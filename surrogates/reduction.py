@@ -1,18 +1,20 @@
 """Reductions: states (node, batch, 3) to latent vectors (batch, latent) and back.
 
-Each is a module with `encode` and `decode`; a level does not care which one it holds. Adding a reduction is one class
-here and one line in `make_reduction`.
+Each is a module with `encode` and `decode`; a level does not care which one it holds. Adding a reduction is one class and
+one call of `register`, here or in a package of your own (`examples/add_reduction.py`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from surrogates.config import LevelSettings
+from surrogates.config import REDUCTIONS, LevelSettings
 from surrogates.errors import SurrogateError
 from surrogates.networks import fully_connected
 from surrogates.operators import GraphDecoder, GraphEncoder, GraphOperator
@@ -30,8 +32,12 @@ class Reduction(nn.Module):
         raise SurrogateError(f"{type(self).__name__} cannot decode")
 
     def decode_only(self) -> None:
-        """Give up the encoder, where another level encodes."""
-        raise SurrogateError(f"{type(self).__name__} cannot do without its encoder")
+        """Give up the encoder, where another level encodes (only `unified` needs it)."""
+        raise SurrogateError(f"{type(self).__name__} cannot do without its encoder; set unified=false")
+
+    def end_at_zero(self) -> None:
+        """Give zero in both directions until training moves it, beside a linear part (only `level.start=pod` needs it)."""
+        raise SurrogateError(f"{type(self).__name__} cannot stand beside a linear part; set level.start=plain")
 
 
 @dataclass(frozen=True)
@@ -137,7 +143,7 @@ class LinearReduction(Reduction):
 class SumReduction(Reduction):
     """A linear reduction and a nonlinear one, added in both directions."""
 
-    def __init__(self, linear: LinearReduction, remainder: GraphReduction | DenseReduction) -> None:
+    def __init__(self, linear: LinearReduction, remainder: Reduction) -> None:
         super().__init__()
         self.linear = linear
         self.remainder = remainder
@@ -155,11 +161,47 @@ class SumReduction(Reduction):
         self.remainder.decode_only()
 
 
-def make_reduction(settings: LevelSettings, edges: object, n_nodes: int, decoded: int | None = None) -> Reduction:
-    """The reduction that `settings` describe, on a graph of `n_nodes` with edges (e, 2).
+# Settings, edges (e, 2) where the mesh has them, number of nodes, and the length of the latent vector that is decoded.
+Maker = Callable[[LevelSettings, NDArray[np.int32] | None, int, int], Reduction]
 
-    `decoded` is the length of the latent vector that the decoder reads: longer than the encoder's where the latent
-    vectors of several levels stand side by side.
+
+def _graph(settings: LevelSettings, edges: NDArray[np.int32] | None, n_nodes: int, decoded: int) -> Reduction:
+    if edges is None:
+        raise SurrogateError(
+            "graph convolutions need the edges of the mesh, and it has none; choose level.reduction=ae"
+        )
+    operator = GraphOperator(edges, n_nodes, kind=settings.convolution)
+    return GraphReduction(operator, settings.latent, decoded, settings.channels, settings.order)
+
+
+def _dense(settings: LevelSettings, edges: NDArray[np.int32] | None, n_nodes: int, decoded: int) -> Reduction:
+    return DenseReduction(n_nodes, settings.latent, decoded, settings.hidden)
+
+
+def _pod(settings: LevelSettings, edges: NDArray[np.int32] | None, n_nodes: int, decoded: int) -> Reduction:
+    return LinearReduction(n_nodes, settings.latent, decoded, trainable=False)
+
+
+_MAKERS: dict[str, Maker] = {"gcn": _graph, "ae": _dense, "pod": _pod}
+
+
+def register(name: str, make: Maker) -> None:
+    """Let settings say `level.reduction=name`. Models stored with it load where it is registered, too.
+
+    make  (settings, edges, n_nodes, decoded) -> Reduction; `decoded` is longer than `settings.latent` where the latent
+          vectors of several levels stand side by side
+    """
+    if name not in REDUCTIONS:
+        REDUCTIONS.append(name)
+    _MAKERS[name] = make
+
+
+def make_reduction(
+    settings: LevelSettings, edges: NDArray[np.int32] | None, n_nodes: int, decoded: int | None = None
+) -> Reduction:
+    """The reduction that `settings` describe, on `n_nodes` nodes with graph edges (e, 2).
+
+    `decoded` is the length of the latent vector that the decoder reads; default: the encoder's.
 
     Raises SurrogateError for a latent vector longer than the state.
     """
@@ -168,16 +210,8 @@ def make_reduction(settings: LevelSettings, edges: object, n_nodes: int, decoded
         raise SurrogateError(
             f"latent size {latent} exceeds the {3 * n_nodes} displacements of {n_nodes} nodes; choose a smaller level.latent"
         )
-    if settings.reduction == "pod":
-        return LinearReduction(n_nodes, latent, decoded, trainable=False)
-    if settings.reduction == "gcn":
-        operator = GraphOperator(edges, n_nodes, kind=settings.convolution)  # type: ignore[arg-type]
-        made: GraphReduction | DenseReduction = GraphReduction(
-            operator, latent, decoded, settings.channels, settings.order
-        )
-    else:
-        made = DenseReduction(n_nodes, latent, decoded, settings.hidden)
-    if settings.start == "plain":
+    made = _MAKERS[settings.reduction](settings, edges, n_nodes, decoded)
+    if settings.start == "plain" or isinstance(made, LinearReduction):
         return made
     return SumReduction(LinearReduction(n_nodes, latent, decoded, trainable=True), made)
 

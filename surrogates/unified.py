@@ -37,8 +37,9 @@ class Unified(Network):
         self.reductions = nn.ModuleDict()
         self.upsamplings = nn.ModuleDict()
         for k, number in enumerate(numbers):
-            edges = graphs.edges(number) if settings.for_level(number).reduction == "gcn" else None
-            reduction = make_reduction(settings.for_level(number), edges, graphs.n_nodes(number), own.latent)
+            reduction = make_reduction(
+                settings.for_level(number), graphs.edges(number), graphs.n_nodes(number), own.latent
+            )
             if number != finest:
                 reduction.decode_only()
             self.reductions[str(number)] = reduction

@@ -129,7 +129,7 @@ def largest_product(chosen: Settings, campaign: Campaign) -> int:
     for number in chosen.levels or tuple(level.index for level in campaign.levels):
         level = chosen.for_level(number)
         nodes = campaign.n_nodes if number == 0 else campaign.levels[number - 1].n_nodes
-        width = {"gcn": max(3, *level.channels), "ae": 3, "pod": 0}[level.reduction]
+        width = {"gcn": max(3, *level.channels), "pod": 0}.get(level.reduction, 3)
         out = max(out, nodes * width * level.batch)
     return out
 
