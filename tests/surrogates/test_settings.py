@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from pydantic import BaseModel
 
 from surrogates.config import Settings, parse, settings
 from surrogates.errors import SurrogateError
@@ -92,3 +95,23 @@ def test_levels_that_start_from_a_coarser_one_train_for_a_share_of_the_epochs() 
     assert chosen.for_level(3).epochs == 50
     assert chosen.for_level(2, transferred=True).epochs == 5
     assert chosen.for_level(1, transferred=True).epochs == 7
+
+
+def paths(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
+    for name, field in model.model_fields.items():
+        kind = field.annotation
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            yield from paths(kind, f"{prefix}{name}.")
+        else:
+            yield prefix + name
+
+
+def test_the_documentation_names_every_setting() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "surrogates.md").read_text(encoding="utf-8")
+    rows = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
+    told = set()
+    for row in rows:
+        names = re.findall(r"`([\w.]+)`", row)
+        group = names[0].rpartition(".")[0] if names else ""
+        told |= {name if "." in name or not group else f"{group}.{name}" for name in names}
+    assert set(paths(Settings)) - {"model", "preset"} - told == set()
