@@ -83,7 +83,7 @@ def closest_weights(
 def settle(
     points: NDArray, start: NDArray, candidate: NDArray, at: NDArray, cells: NDArray, cell_start: NDArray,
     cell_list: NDArray, near_start: NDArray, near_list: NDArray, hops: int,
-) -> tuple[NDArray, NDArray, NDArray, NDArray]:  # fmt: skip
+) -> tuple[NDArray, NDArray]:  # fmt: skip
     """Weights of each point on its cell, taking `candidate` where the graph agrees that it is near.
 
     points (n, 3); start (n,): the coarse node that stands for each point; candidate (n,): closest cell found without
@@ -91,13 +91,11 @@ def settle(
     `near_list`: its graph neighbours. A candidate none of whose nodes can be reached from `start` within `hops` edges
     lies on another sheet; the closest cell among those reached stands in for it.
 
-    Returns cell (n,), weights (n, 3), squared distance (n,) and whether the candidate was overruled (n,).
+    Returns cell (n,) and weights (n, 3).
     """
     n = len(points)
     cell_of = np.empty(n, np.int64)
     weights = np.zeros((n, 3))
-    distance2 = np.empty(n)
-    overruled = np.zeros(n, np.bool_)
     seen = np.full(len(at), -1, np.int64)
     looked = np.full(len(cells), -1, np.int64)
     reached = np.empty(len(at), np.int64)
@@ -131,7 +129,6 @@ def settle(
                         d = closest_weights(points, i, at, cells, other)[3]
                         if d < best:
                             best, c = d, other
-            overruled[i] = True
-        weights[i, 0], weights[i, 1], weights[i, 2], distance2[i] = closest_weights(points, i, at, cells, c)
+        weights[i, 0], weights[i, 1], weights[i, 2], _ = closest_weights(points, i, at, cells, c)
         cell_of[i] = c
-    return cell_of, weights, distance2, overruled
+    return cell_of, weights

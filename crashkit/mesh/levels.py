@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from crashkit.mesh.surface import adjacency
+
 
 @dataclass(frozen=True)
 class Level:
@@ -45,10 +47,7 @@ class Level:
     @cached_property
     def adjacency(self) -> sparse.csr_matrix:
         """Symmetric 0/1 adjacency (n, n) of `edges`, without loops."""
-        i, j = self.edges.T
-        n = self.n_nodes
-        one = sparse.csr_matrix((np.ones(len(i)), (i, j)), shape=(n, n))
-        return ((one + one.T) > 0).astype(np.float64).tocsr()
+        return adjacency(self.n_nodes, self.edges)
 
 
 @dataclass(frozen=True)

@@ -92,7 +92,7 @@ def probe_map(
         candidate = closest_cells(points[rows], parts[rows], coarse, cells)
         graph = adjacency(k, edges)
         cell_start, cell_list = cells_of_nodes(cells.nodes, k)
-        found, weight, _, _ = _closest.settle(
+        found, weight = _closest.settle(
             points[rows], into[rows].astype(np.int64), candidate, coarse, cells.nodes,
             cell_start, cell_list, graph.indptr, graph.indices, hops,
         )  # fmt: skip
@@ -101,7 +101,6 @@ def probe_map(
     columns[same, 0] = np.arange(k)
     weights[weights < 1e-12] = 0.0
     weights /= weights.sum(axis=1, keepdims=True)
-    u = sparse.csr_matrix((n, k))
     here = weights > 0
     row = np.broadcast_to(np.arange(n)[:, None], (n, 3))[here]
     u = sparse.csr_matrix((weights[here], (row, columns[here])), shape=(n, k))
