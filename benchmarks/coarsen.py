@@ -175,7 +175,7 @@ def compare(
     n = len(position)
     counts = [c for c in counts or [n // 8, n // 32, n // 128] if c < n]
     mesh = surface(position, faces)
-    print(f"\n{name}: {n} nodes; distance mean / max ({unit}), lifting error (cm)")
+    print(f"\n{name}: {n} nodes; distance mean / max ({unit})" + (", lifting error (cm)" if path else ""))
     print(f"{'':30s}" + "".join(f"{c:>24d}" for c in counts))
     coarse = [decimated(position, faces, count) for count in counts]
     rows = {
@@ -201,7 +201,7 @@ def compare(
         entries.append(entry(f"{at}: lifting error / vtkQuadricDecimation's", ours / theirs, 1.0, note))
         if n == 4600 and count in LIFTING_GOAL:
             goal = LIFTING_GOAL[count]
-            entries.append(entry(f"{at}: lifting error / {goal} cm", 100 * ours / goal, 1.0, note))
+            entries.append(entry(f"{at}: lifting error / {goal} cm", 100 * ours / goal, 1.0, f"{100 * ours:.3f} cm"))
     return entries
 
 
