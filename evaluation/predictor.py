@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,18 @@ class Predictor(Protocol):
 
     def reconstruct(self, displacement: NDArray[np.float32]) -> NDArray[np.float32]:
         """Encode and decode (state, node of its level, 3): what reduction alone costs."""
+
+
+# Share of nodes and states that the bands in tables promise.
+NOMINAL = 0.9
+
+
+@runtime_checkable
+class Banded(Protocol):
+    """A predictor that also says how far it may be wrong."""
+
+    def half_width(self, share: float, time: NDArray[np.float64]) -> NDArray[np.float32] | None:
+        """(state, node of the full mesh), m: that share of nodes and states lies within; None where it cannot say."""
 
 
 @dataclass(frozen=True)

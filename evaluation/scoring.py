@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from evaluation.errors import EvaluationError
 from evaluation.measures import Peak, lift, masked_mean, mean_node_error, node_distance
 from evaluation.pod import held, projection_error
-from evaluation.predictor import Mesh, Predictor
+from evaluation.predictor import NOMINAL, Banded, Mesh, Predictor
 from evaluation.reference import Reference
 from evaluation.sensors import Parted, Sensors, Watched, joined, part_error, watch
 from evaluation.tally import Groups, Tally, state_blocks
@@ -40,6 +40,7 @@ class RunScore:
     groups          name of a grouping ("part", "region") -> (group,) error
     parted          errors of rigid motion and of deformation
     watched         what the sensors would see of the prediction; None without sensors
+    covered         share of nodes and states within the predictor's own band of `NOMINAL`; NaN where it gives none
     """
 
     e2: NDArray[np.float64]
@@ -55,6 +56,7 @@ class RunScore:
     groups: Mapping[str, NDArray[np.float64]]
     parted: Parted
     watched: Watched | None = None
+    covered: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -144,12 +146,13 @@ def _score(
     # A reduction is asked about whole states; what is gone there stays where it was.
     own = held(truth) if mesh is None else held(truth[:, mesh.kept])
     asked, again = Tally(groups, reference.n_nodes), Tally({_LEVELS: groups[_LEVELS]}, reference.n_nodes)
-    parted, watched = [], []
+    parted, watched, within = [], [], []
     for states in state_blocks(*truth.shape[:2]):
         count = states.stop - states.start
         field = predictor.predict(reference.parameters[run], reference.time[states])
         prediction = full_field(reference, predictor, field, count)
         asked.add(truth[states], prediction)
+        within.append(_within(predictor, reference.time[states], truth[states], prediction))
         parted.append(part_error(reference, run, truth[states], prediction))
         if sensors is not None:
             watched.append(watch(reference, sensors, run, prediction))
@@ -168,7 +171,23 @@ def _score(
         groups={name: asked.of_groups(name) for name in groups if name != _LEVELS},
         parted=joined(parted),
         watched=joined(watched) if watched else None,
+        covered=_share(np.concatenate(within)),
     )
+
+
+def _within(
+    predictor: Predictor, time: NDArray[np.float64], truth: NDArray[np.float32], prediction: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """(n,) whether each node and state that is there lies within the predictor's band; empty where it gives none."""
+    width = predictor.half_width(NOMINAL, time) if isinstance(predictor, Banded) else None
+    if width is None:
+        return np.zeros(0, bool)
+    distance = node_distance(truth, prediction)
+    return (distance <= width)[np.isfinite(distance)]
+
+
+def _share(within: NDArray[np.bool_]) -> float:
+    return float(within.mean()) if len(within) else float("nan")
 
 
 def _sizes(
@@ -225,7 +244,7 @@ class Scores:
 
     e2, reconstruction, q95, largest    (seed, run, state)
     on_level, on_level_reconstruction   (seed, run, level)
-    relative, peak_value, peak_state, peak_node  (seed, run)
+    relative, covered, peak_value, peak_state, peak_node  (seed, run)
     node_mean                           (node,) over seeds, runs and states
     groups                              grouping -> (seed, run, group)
     rigid, deformation                  (seed, run, state); true_rigid, true_deformation (run, state) their sizes
@@ -240,6 +259,7 @@ class Scores:
     on_level: NDArray[np.float64]
     on_level_reconstruction: NDArray[np.float64]
     relative: NDArray[np.float64]
+    covered: NDArray[np.float64]
     peak_value: NDArray[np.float64]
     peak_state: NDArray[np.int64]
     peak_node: NDArray[np.int64]
@@ -294,7 +314,7 @@ def gather(runs: Iterable[RunScores], keys: Sequence[Key]) -> Scores:
         **{
             name: stack(name)
             for name in (
-                "e2", "reconstruction", "q95", "largest", "on_level", "on_level_reconstruction", "relative",
+                "e2", "reconstruction", "q95", "largest", "on_level", "on_level_reconstruction", "relative", "covered",
             )
         },
         peak_value=np.array([[s.peak.value for s in row] for row in table]),

@@ -25,6 +25,7 @@ class Performance:
     reduction           error of encoding and decoding the truth
     pod_floor           projection on as many modes as the model has latent numbers
     lifting             cost of the static upsampling alone
+    covered             share of nodes and states of the test runs within the model's own 90 % band; NaN without one
     """
 
     model: str
@@ -40,6 +41,7 @@ class Performance:
     reduction_cm: float
     pod_floor_cm: float
     lifting_cm: float
+    covered: float
     latent: int
     parameters: int
     seconds_per_epoch: float
@@ -74,6 +76,7 @@ def performance(evaluation: Evaluation) -> list[Performance]:
                 reduction_cm=scores.reduction * CM,
                 pod_floor_cm=evaluation.floor_at(predictor.n_latent) * CM,
                 lifting_cm=evaluation.lifting(entry.level) * CM,
+                covered=_mean(scores.covered.ravel().tolist()),
                 latent=predictor.n_latent,
                 parameters=predictor.n_parameters,
                 seconds_per_epoch=_mean([p.seconds_per_epoch for p in seeds]),

@@ -164,6 +164,11 @@ class Surrogate:
             parts = [core.reconstruct(part.transpose(0, 1), number) for part in torch.from_numpy(x).split(_CHUNK)]
         return torch.cat([part.transpose(0, 1) for part in parts]).contiguous().numpy()
 
+    def has_band(self, level: int | None = None) -> bool:
+        """Whether enough validation runs were held out for `band` on the full mesh."""
+        number = self.number(level)
+        return (number, number > 0) in self.bands
+
     def band(
         self, coverage: float = 0.9, time: ArrayLike | None = None, level: int | None = None, *, full: bool = False
     ) -> NDArray[np.float32]:

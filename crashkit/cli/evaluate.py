@@ -225,6 +225,10 @@ class StoredLevel:
     def reconstruct(self, displacement: NDArray[np.float32]) -> NDArray[np.float32]:
         return self.surrogate.reconstruct(displacement, self.level)
 
+    def half_width(self, share: float, time: NDArray[np.float64]) -> NDArray[np.float32] | None:
+        known = self.surrogate.has_band(self.level)
+        return self.surrogate.band(share, time, self.level, full=True) if known else None
+
 
 def as_model(surrogate: Surrogate, folder: Path, reference: Reference) -> Model:
     """A surrogate, stored in `folder`, as evaluation sees it: one predictor a level, and the runs it has seen.
