@@ -11,6 +11,8 @@ from crashkit.errors import DataError
 
 # Times that differ by less than this fraction of the latest are the same: solvers keep them in single precision.
 _SAME = 1e-6
+# A run's last state also stands for times behind it up to this fraction of its last step.
+_END = 0.05
 
 
 def common_time(times: Sequence[NDArray[np.float64]], wanted: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
@@ -21,15 +23,16 @@ def common_time(times: Sequence[NDArray[np.float64]], wanted: NDArray[np.float64
     Solvers write the first state after a time is reached, so runs end at slightly different times: without `wanted`,
     ends within half a step of each other are brought to the earliest. Nothing is extrapolated.
 
-    Raises DataError where `wanted` is not increasing or goes beyond a run, or where runs have no common span.
+    Raises DataError where `wanted` is not increasing or goes beyond the `reach` of a run, or where runs have no common span.
     """
     begin, end = max(float(t[0]) for t in times), min(float(t[-1]) for t in times)
     slack = _SAME * max(abs(end), abs(begin))
     if wanted is not None:
+        last = min(reach(t) for t in times)
         grid = np.asarray(wanted, np.float64)
         if grid.ndim != 1 or not len(grid) or not np.isfinite(grid).all() or (np.diff(grid) <= 0).any():
             raise DataError("the times asked for are not increasing numbers; give them in seconds, the earliest first")
-        if grid[0] < begin - slack or grid[-1] > end + slack:
+        if grid[0] < begin - slack or grid[-1] > last:
             raise DataError(
                 f"times {grid[0]:g} to {grid[-1]:g} s were asked for, but all runs together cover {begin:g} to {end:g} s; "
                 "ask for less, or leave out the short runs"
@@ -38,8 +41,8 @@ def common_time(times: Sequence[NDArray[np.float64]], wanted: NDArray[np.float64
     coarsest = min(times, key=lambda t: (len(t), -float(t[-1])))
     if end < begin:
         raise DataError(f"the runs have no time in common (one begins at {begin:g} s, one ends at {end:g} s)")
-    reach = max(slack, 0.499 * float(np.median(np.diff(coarsest))) if len(coarsest) > 1 else 0.0)
-    grid = coarsest[(coarsest >= begin - reach) & (coarsest <= end + reach)].copy()
+    near = max(slack, 0.499 * float(np.median(np.diff(coarsest))) if len(coarsest) > 1 else 0.0)
+    grid = coarsest[(coarsest >= begin - near) & (coarsest <= end + near)].copy()
     if len(grid) == 0:
         raise DataError(
             f"no output time of the coarsest run lies in what all runs cover, {begin:g} to {end:g} s; give --time"
@@ -51,6 +54,16 @@ def common_time(times: Sequence[NDArray[np.float64]], wanted: NDArray[np.float64
     return grid
 
 
+def reach(own: NDArray[np.float64]) -> float:
+    """The latest time, s, that the states at the times `own` (state,) stand for.
+
+    Solvers write a state at the first time step behind its output time, so a run may end a hair before the others; its
+    last state then stands for that hair, and `interpolation_error` counts it.
+    """
+    last = float(own[-1])
+    return last + max(_SAME * abs(last), _END * (last - float(own[-2])) if len(own) > 1 else 0.0)
+
+
 def same_time(own: NDArray[np.float64], common: NDArray[np.float64]) -> bool:
     """Whether a run's own times are the common ones, so that nothing needs to be interpolated."""
     return len(own) == len(common) and bool((np.abs(own - common) <= _SAME * np.abs(common).max(initial=0.0)).all())
@@ -59,7 +72,7 @@ def same_time(own: NDArray[np.float64], common: NDArray[np.float64]) -> bool:
 def interpolate(
     values: NDArray, own: NDArray[np.float64], common: NDArray[np.float64], *, cubic: bool = True
 ) -> NDArray:
-    """`values` (own state, ...) at the `common` times; NaN after the last own time.
+    """`values` (own state, ...) at the `common` times; NaN behind what the last state stands for (`reach`).
 
     Cubic: Hermite polynomials whose slopes are those of the parabola through a state and its neighbours (Catmull-Rom
     where steps are even). On real crash runs their mean error is two thirds of that of straight lines. Straight
@@ -76,7 +89,7 @@ def interpolate(
             out[k] = _hermite(values, own, n, f)
         else:
             out[k] = values[n] * (1 - f) + values[n + 1] * f
-    beyond = common > own[-1] + _SAME * abs(own[-1])
+    beyond = common > reach(own)
     if beyond.any():
         out[beyond] = np.nan
     return out
@@ -87,12 +100,18 @@ def interpolation_error(values: NDArray, own: NDArray[np.float64], common: NDArr
 
     Every own state is predicted from its neighbours alone, at twice the step, and compared; the larger miss at the
     ends of an interval counts with 4 f (1 - f) at the fraction f of it that is asked for. On real crash runs the
-    estimate is about twice the true largest error.
+    estimate is about twice the true largest error. Where the last state stands for a later time, what the structure
+    moves in between at its last speed is counted.
     """
+    late = common[(common > own[-1] * (1 + _SAME)) & (common <= reach(own))]
+    held = 0.0
+    if len(late) and len(own) > 1:
+        moved = np.sqrt(((values[-1] - values[-2]).astype(np.float64) ** 2).sum(axis=-1))
+        held = float(np.nan_to_num(moved).max(initial=0.0) * (late[-1] - own[-1]) / (own[-1] - own[-2]))
     left, fraction = _places(own, common)
     weight = 4 * fraction * (1 - fraction)
     if not weight.any():
-        return 0.0
+        return held
     needed = set(left[weight > 0]) | set(left[weight > 0] + 1)
     miss = np.zeros(len(own))
     for k in sorted(needed & set(range(1, len(own) - 1))):
@@ -102,7 +121,7 @@ def interpolation_error(values: NDArray, own: NDArray[np.float64], common: NDArr
         predicted = _hermite(values[near], own[near], place, (own[k] - own[k - 1]) / h)
         apart = np.sqrt(((predicted - values[k]).astype(np.float64) ** 2).sum(axis=-1))
         miss[k] = np.nan_to_num(apart).max(initial=0.0)
-    return float((weight * np.maximum(miss[left], miss[np.minimum(left + 1, len(own) - 1)])).max())
+    return max(held, float((weight * np.maximum(miss[left], miss[np.minimum(left + 1, len(own) - 1)])).max()))
 
 
 def flags_at(flags: NDArray[np.bool_], own: NDArray[np.float64], common: NDArray[np.float64]) -> NDArray[np.bool_]:

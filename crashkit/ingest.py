@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit import __version__
-from crashkit.alignment import common_time, same_time
+from crashkit.alignment import common_time, reach, same_time
 from crashkit.assembly import Existing, publish
 from crashkit.errors import CrashkitError, DataError, OutputError, ReadError
 from crashkit.staging import BackgroundHashes, StagedRun, Staging, key_of
@@ -248,8 +248,8 @@ class _Job:
         out = []
         for found in look.found:
             slack = 1e-6 * float(np.abs(found.time).max())
-            late = found.complete and found.time[-1] < grid[-1] - slack
-            if late or found.time[0] > grid[0] + slack:
+            ends_early = found.complete and reach(found.time) < grid[-1]
+            if ends_early or found.time[0] > grid[0] + slack:
                 error = DataError(
                     f"{found.source}: covers {found.time[0]:g} to {found.time[-1]:g} s, the dataset's times are "
                     f"{grid[0]:g} to {grid[-1]:g} s; nothing is extrapolated"

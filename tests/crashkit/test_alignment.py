@@ -98,6 +98,23 @@ def test_ends_a_little_apart_are_brought_together() -> None:
     assert not same_time(np.array([0, 1, 2.0]), np.array([0, 1, 2.001]))
 
 
+def test_last_state_stands_for_a_hair_behind_it_and_is_counted() -> None:
+    own = np.array([0.0, 1, 2, 3])
+    values = np.zeros((4, 2, 3))
+    values[3, 1] = [0.3, 0.4, 0.0]  # 0.5 in the last step
+    grid = np.array([0, 1, 2, 3.04])
+    np.testing.assert_array_equal(interpolate(values, own, grid), values)
+    assert interpolation_error(values, own, grid) == pytest.approx(0.04 * 0.5)
+    np.testing.assert_array_equal(common_time([own], grid), grid)
+
+
+def test_behind_that_hair_nothing_is_made_up() -> None:
+    own = np.array([0.0, 1, 2, 3])
+    assert np.isnan(interpolate(np.ones((4, 1)), own, np.array([0, 3.06]))[1]).all()
+    with pytest.raises(DataError, match="cover 0 to 3 s"):
+        common_time([own], np.array([0, 3.06]))
+
+
 def test_a_single_state_needs_no_grid() -> None:
     np.testing.assert_array_equal(common_time([np.array([0.0])]), [0.0])
 

@@ -231,6 +231,31 @@ def test_error_of_kinked_motion_is_in_dataset_and_summary(place: Place) -> None:
     assert place.summary.alignment_error["kinked"] == float(ds["alignment_error"][0])
 
 
+def test_states_that_common_times_lose_at_the_end_are_told(place: Place) -> None:
+    ds = place.ingest(MemoryRun("long"), MemoryRun("short", time=np.linspace(0, 3.4, 5)))
+    np.testing.assert_allclose(ds["time"], [0, 1e-3, 2e-3, 3e-3])
+    told = "the common times end at 0.003 s, since run short ends at 0.0034 s; run long goes on to 0.004 s"
+    assert told in place.summary.notes
+
+
+def test_ends_a_hair_apart_lose_no_state(place: Place) -> None:
+    ds = place.ingest(MemoryRun("a"), MemoryRun("b", time=[0, 1, 2, 3, 3.999]))
+    np.testing.assert_allclose(ds["time"], [0, 1e-3, 2e-3, 3e-3, 3.999e-3])
+    assert not any("common times" in note for note in place.summary.notes)
+
+
+def test_run_that_ends_a_hair_before_the_dataset_joins_it(tmp_path: Path, memory: RunsInMemory) -> None:
+    first = memory.put(tmp_path / "first.txt", MemoryRun("a"))
+    second = memory.put(tmp_path / "second.txt", MemoryRun("b", time=[0, 1, 2, 3, 3.999]))
+    ingest(first, tmp_path / "out.zarr")
+    summary = ingest(second, tmp_path / "out.zarr")
+    assert summary.runs == ("a", "b")
+    ds = open_dataset(tmp_path / "out.zarr")
+    assert float(ds["displacement"][1, -1, 0, 0]) == pytest.approx(2.0 * 3.999e-3)
+    assert 1e-6 < summary.alignment_error["b"] < 1e-5  # 1 us at some 5 m/s
+    assert validate(ds) == []
+
+
 def test_erosion_at_common_times_is_on_the_safe_side(place: Place) -> None:
     ds = place.ingest(MemoryRun(alive=erosion()), time=np.array([0, 2.0, 2.5, 3, 4]) * 1e-3)
     assert ds["alive"].values[0, :, 6].tolist() == [True, True, False, False, False]
@@ -248,6 +273,15 @@ def test_given_times_are_those_of_the_dataset(place: Place, inner: list[float]) 
     x = plate().position[:13, 0]
     exact = 0.01 * x * (wanted[:, None] * 1e3) ** 2 * 1e-3
     np.testing.assert_allclose(ds["displacement"][0, :, :, 2], exact, rtol=1e-4, atol=1e-9)
+
+
+def test_field_of_unknown_unit_stays_as_it_is_and_says_so(place: Place) -> None:
+    values = np.arange(5 * 17, dtype=np.float32).reshape(5, 17)
+    field = {"temperature": (FieldInfo("temperature", "node", quantity="temperature"), values)}
+    ds = place.ingest(MemoryRun(fields=field), fields=["temperature"])
+    assert ds["temperature"].attrs["units"] == "unknown"
+    np.testing.assert_array_equal(ds["temperature"][0], values[:, :13])
+    assert any(note.startswith("field temperature: no source says its unit") for note in place.summary.notes)
 
 
 # Reasons to refuse
