@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
-from crashkit.readers._lasso import geometry_class, guarded
+from crashkit.readers._lasso import geometry_class, guarded, header_class
 
 _END = -999999.0
 _HEADER_WORDS = 64
@@ -91,10 +91,8 @@ class D3plotFile:
 
     def _check_header(self, size: int) -> int:
         """Bytes that the header's counts ask for. Raises ReadError where they cannot be true."""
-        from lasso.dyna.d3plot_header import D3plotHeader
-
         with guarded(self.first):
-            header = D3plotHeader(str(self.first))
+            header = header_class()(str(self.first))
         words = header.raw_header
         for name in _COUNTS:
             if words.get(name, 0) < 0:

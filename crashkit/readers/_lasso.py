@@ -19,8 +19,18 @@ from crashkit.errors import ReadError
 
 
 @cache
+def header_class() -> Any:
+    """lasso-python's D3plotHeader."""
+    _swallowed()
+    from lasso.dyna.d3plot_header import D3plotHeader
+
+    return D3plotHeader
+
+
+@cache
 def geometry_class() -> Any:
     """lasso-python's D3plot for a geometry section in memory, with its loops bounded."""
+    _swallowed()
     from lasso.dyna import D3plot
     from lasso.io.binary_buffer import BinaryBuffer
 
@@ -78,7 +88,8 @@ class _Swallowed(logging.Handler):
 
 @cache
 def _swallowed() -> _Swallowed:
-    # lasso-python configures the root logger when imported; that is for the application to do.
+    # lasso-python configures the root logger when imported, which is for the application to do: this has to be the
+    # first import of it, so that what it adds can be told and taken away again.
     root = logging.getLogger()
     before = list(root.handlers)
     from lasso.dyna import d3plot, d3plot_header
