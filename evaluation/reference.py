@@ -94,7 +94,7 @@ class Reference:
 
 
 def reference_of(
-    dataset: xr.Dataset, levels: Sequence[Level] = (), checksum: str = "", attributes: Mapping[str, str] | None = None
+    dataset: xr.Dataset, levels: Sequence[Level] = (), attributes: Mapping[str, str] | None = None
 ) -> Reference:
     """The runs of a crash dataset (`data_schema`); reads no field until one is asked for."""
     from data_schema import parameters
@@ -120,7 +120,7 @@ def reference_of(
         node_id=dataset["node_id"].values,
         part_id=dataset["part_id"].values,
         levels=tuple(levels),
-        checksum=checksum,
+        checksum=str(dataset.attrs.get("checksum", "")),
         attributes={str(k): str(v) for k, v in dataset.attrs.items()} | dict(attributes or {}),
         positions=(lambda k: position.isel(sim=k).values.astype(np.float64)) if by_run else None,
         alive=(lambda k: life.isel(sim=k).values.astype(bool)) if life is not None else None,

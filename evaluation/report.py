@@ -12,7 +12,7 @@ import numpy as np
 from evaluation import tables
 from evaluation.curves import rating_table
 from evaluation.errors import EvaluationError
-from evaluation.figures import ORDER, drawings, sheet_of
+from evaluation.figures import drawings, sheet_of
 from evaluation.figures.kind import Columns, to_csv
 from evaluation.figures.style import CM, called
 from evaluation.page import Page, ShownFigure, ShownTable, ShownView, plain_json, render_page, show_figure, show_table
@@ -61,12 +61,12 @@ def write_report(
     *,
     title: str = "How far can these surrogates be trusted?",
     view: bool = True,
-    names: Sequence[str] = ORDER,
+    names: Sequence[str] | None = None,
     done: Callable[[str], None] | None = None,
 ) -> Path:
     """Write report.html, report.json, figures/ (PNG, SVG, CSV) and tables/ (CSV) into `folder`; returns the page.
 
-    names  the figures, in their order
+    names  the figures, in their order; default: all (figures.kinds)
     view   whether to make an interactive view of the worst run, where the viewer extra is there
     done   called with the name of each figure when it is written
     """

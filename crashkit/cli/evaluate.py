@@ -64,7 +64,7 @@ def evaluate(
     written.
     """
     from evaluation.comparison import agree_on_split, entries
-    from evaluation.figures import ORDER
+    from evaluation.figures import kinds
     from evaluation.files import default_runs, write_run
     from evaluation.output import complete_folder
     from evaluation.report import write_report
@@ -102,8 +102,8 @@ def evaluate(
                     written += write_run(result, run, folder / "vtk")
                     step(run)
             result = dataclasses.replace(result, files=tuple(written))
-        with _counted(tell, "figures", len(ORDER)) as step:
-            write_report(result, folder, names=ORDER, done=lambda name: step(0))
+        with _counted(tell, "figures", len(kinds())) as step:
+            write_report(result, folder, done=lambda name: step(0))
     return result
 
 
@@ -174,7 +174,7 @@ def _opened(dataset: str, models: tuple[str, ...]) -> tuple[Reference, tuple[Mod
     opened = open_dataset(dataset, chunks=None)
     coarse = any(number > 0 for _, s in surrogates for number in s.level_names.values())
     levels = read_hierarchy(dataset).levels if coarse or has_hierarchy(dataset) else ()
-    reference = reference_of(opened, levels, str(opened.attrs.get("checksum", "")))
+    reference = reference_of(opened, levels)
     reference = dataclasses.replace(reference, displacement=_reader(dataset, opened))
     return reference, tuple(as_model(surrogate, folder, reference) for folder, surrogate in surrogates)
 

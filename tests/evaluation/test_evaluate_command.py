@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import runpy
 import shutil
+import sys
 from pathlib import Path
 
 import h5py
@@ -241,3 +243,42 @@ def test_info_writes_the_data_card(campaign, tmp_path):
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout)["report"] == str(tmp_path / "card" / "card.html")
     assert "figure-coverage" in (tmp_path / "card" / "card.html").read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def forgetful(monkeypatch):
+    """A registry of figures that forgets what a test adds."""
+    monkeypatch.setattr("evaluation.figures._FURTHER", {})
+
+
+def test_a_figure_of_somebody_else_stands_in_the_report(campaign, small, forgetful, tmp_path, monkeypatch):
+    out = tmp_path / "report"
+    monkeypatch.setattr(sys, "argv", ["add_figure.py", *map(str, (campaign / "kart.zarr", out, campaign / "podnn"))])
+    script = Path(__file__).parents[2] / "examples" / "add_figure.py"
+    runpy.run_path(str(script), run_name="__main__")
+    assert len(script.read_text(encoding="utf-8").splitlines()) < 60
+    assert "Error over motion" in (out / "report.html").read_text(encoding="utf-8")
+    lines = (out / "figures" / "error_over_motion.csv").read_text().splitlines()
+    assert lines[0] == "mean_displacement_cm,PODNN (cm)"
+    assert len(lines) == 1 + 3 * 6  # test runs and states
+    assert (out / "figures" / "error_over_motion.svg").exists()
+
+
+def test_a_figure_cannot_take_the_name_of_ours(forgetful):
+    from evaluation.errors import EvaluationError
+    from evaluation.figures import Kind, register
+
+    with pytest.raises(EvaluationError, match="has a figure 'floors' already"):
+        register(Kind("floors", "Mine", lambda evaluation: None))
+
+
+def test_a_figure_that_cannot_be_loaded_does_not_stop_the_others(forgetful, monkeypatch, caplog):
+    from importlib.metadata import EntryPoint
+
+    from evaluation import figures
+
+    broken = EntryPoint("broken", "no.such:module", figures.ENTRY_POINT_GROUP)
+    monkeypatch.setattr(figures, "entry_points", lambda group: [broken])
+    figures._load_entry_points.cache_clear()
+    assert [kind.name for kind in figures.kinds()] == list(figures.ORDER)
+    assert "figure broken (no.such:module) cannot be loaded" in caplog.text
