@@ -21,7 +21,7 @@ from evaluation.figures.envelopes import Envelopes
 from evaluation.figures.kind import Drawing, Kind, to_csv
 from evaluation.figures.outliers import Outliers, robust_score
 from evaluation.figures.singular_values import SingularValues
-from evaluation.figures.style import CM, MS, Sheet
+from evaluation.figures.style import CM, MS, Sheet, readable
 from evaluation.measures import gone, largest_node_error, mean_node_error, node_distance
 from evaluation.output import complete_folder
 from evaluation.page import Page, plain_json, render_page, show_figure, show_table
@@ -235,8 +235,9 @@ def write_card(
         page = Page(
             title=name,
             subtitle=(
-                f"{len(reference.runs)} runs, {len(reference.time)} states from {reference.time[0] * MS:g} to "
-                f"{reference.time[-1] * MS:g} ms, {reference.n_nodes} nodes, {len(reference.part_names)} parts"
+                f"{len(reference.runs)} runs, {len(reference.time)} states from {reference.time[0] * MS:.4g} to "
+                f"{reference.time[-1] * MS:.4g} ms, {reference.n_nodes} nodes in {len(reference.part_names)} "
+                f"part{'' if len(reference.part_names) == 1 else 's'}"
             ),
             statements=statements,
             rules=(
@@ -274,14 +275,15 @@ def _run_table(reference: Reference, summary: Summary) -> dict[str, list[object]
 
 
 def _parameter_table(reference: Reference) -> dict[str, list[object]]:
-    values = reference.parameters
-    return {
-        "parameter": list(reference.parameter_names),
-        "unit": list(reference.parameter_units),
-        "smallest": [float(v) for v in values.min(axis=0)],
-        "median": [float(v) for v in np.median(values, axis=0)],
-        "largest": [float(v) for v in values.max(axis=0)],
-    }
+    table: dict[str, list[object]] = {name: [] for name in ("parameter", "unit", "smallest", "median", "largest")}
+    for name, unit, column in zip(
+        reference.parameter_names, reference.parameter_units, reference.parameters.T, strict=True
+    ):
+        values, shown = readable(column, unit)
+        row = (name, shown, float(values.min()), float(np.median(values)), float(values.max()))
+        for column_name, value in zip(table, row, strict=True):
+            table[column_name].append(value)
+    return table
 
 
 def _facts(reference: Reference) -> list[tuple[str, str]]:

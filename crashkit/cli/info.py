@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from crashkit.cli._console import console, print_json, say, table
+from crashkit.cli._console import console, print_json, progress, say, table
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -126,7 +126,11 @@ def command(
         if report is not None:
             from evaluation.datacard import write_card
 
-            found["report"] = write_card(dataset, report, about={"Dataset": path.name})
+            with progress() as bar:
+                task = bar.add_task("runs", total=dataset.sizes["sim"], note="")
+                found["report"] = write_card(
+                    dataset, report, about={"Dataset": path.name}, done=lambda run: bar.advance(task)
+                )
     if as_json:
         print_json(found)
         return

@@ -43,6 +43,9 @@ class Coverage:
 
         n = len(self.names)
         columns, units = zip(*(readable(v, u) for v, u in zip(self.values.T, self.units, strict=True)), strict=True)
+        labels = [span(name, unit) for name, unit in zip(self.names, units, strict=True)]
+        if sheet.narrow:
+            labels = [label.replace(" (", "\n(") for label in labels]
         side = min(sheet.width, 4.2 * n)
         with look():
             figure = Figure(figsize=(side / 2.54, side / 2.54), layout="constrained")
@@ -66,12 +69,11 @@ class Coverage:
                         )  # fmt: skip
                     ax.margins(0.06)
                 if i == n - 1:
-                    label = span(self.names[j], units[j])
-                    ax.set_xlabel(label.replace(" (", "\n(") if sheet.narrow else label)
+                    ax.set_xlabel(labels[j])
                 else:
                     ax.tick_params(labelbottom=False)
                 if j == 0 and i > 0:
-                    ax.set_ylabel(span(self.names[i], units[i]))
+                    ax.set_ylabel(labels[i])
                 elif j > 0:
                     ax.tick_params(labelleft=False)
         if self.test.any():

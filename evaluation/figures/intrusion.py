@@ -89,7 +89,7 @@ class IntrusionFigure:
             f"are on the "
             f"unsafe side. Second: its history in the run with the deepest one. It is {true * CM:.1f} cm on average; "
             f"{best} misses it by {misses[best] * CM:.2f} cm, {worst} by {misses[worst] * CM:.2f} cm.{said}"
-            f"{leading(len(self.shown), len(self.predictions))}"
+            f"{leading(len(self.shown), len(self.predictions), _SHOWN)}"
         )
 
 

@@ -79,7 +79,7 @@ class ErrorOverParameters:
             f"Every point is a test run. Points high above the others mark a corner of the design space where "
             f"the model is "
             f"not to be trusted; dotted lines are the range of the training runs, and outside it nothing is "
-            f"known.{trend}{leading(len(self.shown), len(self.errors))}"
+            f"known.{trend}{leading(len(self.shown), len(self.errors), _SHOWN)}"
         )
 
 

@@ -83,7 +83,7 @@ class Probes:
             f"accurate model: resultant displacement, velocity and acceleration. {filtered} A surrogate that is "
             f"right in its "
             f"mean displacement may still be of no use for accelerations; here it shows."
-            f"{leading(len(self.shown), len(self.predictions))}"
+            f"{leading(len(self.shown), len(self.predictions), _SHOWN)}"
         )
 
 

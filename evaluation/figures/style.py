@@ -155,9 +155,9 @@ def called(run: str) -> str:
     return run if run.lower().startswith("run") else f"run {run}"
 
 
-def leading(drawn: int, rows: int) -> str:
-    """What a caption adds where a figure draws the leading `drawn` of all `rows` (Evaluation.leaders)."""
-    return "" if drawn == rows else f" Drawn are the {drawn} most accurate models, each on its best level."
+def leading(drawn: int, rows: int, limit: int) -> str:
+    """What a caption adds where at most `limit` models (Evaluation.leaders), here `drawn` of all `rows`, are drawn."""
+    return "" if drawn == rows else f" Each model is drawn on its best level; at most {limit}, the most accurate, are."
 
 
 def span(label: str, unit: str) -> str:
