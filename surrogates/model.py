@@ -216,15 +216,20 @@ class Surrogate:
         kept = self.record.fits.get(self.number(level))
         return {} if kept is None else {k: np.asarray(v, np.float64) for k, v in kept.history.items() if v}
 
+    def fit(self, level: int | None = None) -> Fit | None:
+        """The training behind `level`: its own, or that of all levels where they were trained together."""
+        number = self.number(level)
+        return self.record.fits.get(min(self.core.numbers) if self.settings.unified else number)
+
     def seconds_per_epoch(self, level: int | None = None) -> float:
         """As measured in training; NaN for models without epochs."""
-        kept = self.record.fits.get(self.number(level))
+        kept = self.fit(level)
         return float("nan") if kept is None else kept.seconds_per_epoch
 
     def training_seconds(self, level: int | None = None) -> float:
-        """Of `level` and the coarser ones it rests on."""
+        """Of `level` and the coarser ones it rests on, or of all levels where they were trained together."""
         number = self.number(level)
-        return sum(kept.seconds for k, kept in self.record.fits.items() if k >= number)
+        return sum(kept.seconds for k, kept in self.record.fits.items() if k >= number or self.settings.unified)
 
     def _by_network(
         self,

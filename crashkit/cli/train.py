@@ -259,13 +259,14 @@ def _show(surrogate: Surrogate, output: Path, as_json: bool) -> None:
             "level": number,
             "nodes": surrogate.graphs.n_nodes(number),
             "parameters": surrogate.n_parameters(number),
-            "epochs": record.fits[number].epochs,
-            "best_epoch": record.fits[number].best_epoch,
-            "seconds": round(record.fits[number].seconds, 2),
-            "status": record.fits[number].status,
+            "epochs": fit.epochs,
+            "best_epoch": fit.best_epoch,
+            "seconds": round(fit.seconds, 2),
+            "status": fit.status,
             "validation_error_m": record.errors.get(name),
         }
         for name, number in surrogate.level_names.items()
+        if (fit := surrogate.fit(number)) is not None
     ]
     if as_json:
         print_json(

@@ -101,6 +101,16 @@ def test_training_stores_a_model_that_has_not_seen_the_test_runs(crash: Path, tm
     assert [p.name for p in tmp_path.iterdir()] == ["m"]
 
 
+def test_levels_trained_together_are_shown_with_their_common_training(crash: Path, tmp_path: Path) -> None:
+    code, out, said = run(
+        "train", crash, "-o", tmp_path / "mh", "--epochs", 2, "--set", "unified=true", "--device", "cpu", "--json"
+    )
+    assert code == 0, said
+    levels = json.loads(out)["levels"]
+    assert len(levels) > 1
+    assert {(row["epochs"], row["seconds"]) for row in levels} == {(2, levels[0]["seconds"])}
+
+
 def test_what_is_trained_from_disk_is_what_is_trained_from_arrays(crash: Path, model: Path) -> None:
     stored = load(model)
     campaign = plate.campaign(
