@@ -10,11 +10,11 @@ from typing import Any
 from torch import Tensor
 
 from surrogates.config import Settings
+from surrogates.dense import Regressor
 from surrogates.graphs import Graphs
 from surrogates.inputs import InputScaling
 from surrogates.level import Level
 from surrogates.network import Network, in_metres
-from surrogates.networks import Regressor
 from surrogates.reduction import make_reduction
 from surrogates.upsampling import Upsampling
 

@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from surrogates.dense import Regressor
 from surrogates.errors import SurrogateError
 from surrogates.network import take_over
-from surrogates.networks import Regressor
 from surrogates.process import LatentProcess
 from surrogates.reduction import LinearReduction, Reduction
 from surrogates.upsampling import Upsampling

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from surrogates.config import REDUCTIONS, LevelSettings
+from surrogates.dense import fully_connected
 from surrogates.errors import SurrogateError
-from surrogates.networks import fully_connected
 from surrogates.operators import GraphDecoder, GraphEncoder, GraphOperator
 
 

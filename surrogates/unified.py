@@ -11,11 +11,11 @@ import torch
 from torch import Tensor, nn
 
 from surrogates.config import Settings
+from surrogates.dense import Regressor
 from surrogates.errors import SurrogateError
 from surrogates.graphs import Graphs
 from surrogates.inputs import InputScaling
 from surrogates.network import Network, in_metres
-from surrogates.networks import Regressor
 from surrogates.reduction import LinearReduction, Reduction, make_reduction
 from surrogates.upsampling import Upsampling
 
