@@ -242,7 +242,10 @@ def test_info_writes_the_data_card(campaign, tmp_path):
     )
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout)["report"] == str(tmp_path / "card" / "card.html")
-    assert "figure-coverage" in (tmp_path / "card" / "card.html").read_text(encoding="utf-8")
+    page = (tmp_path / "card" / "card.html").read_text(encoding="utf-8")
+    assert "figure-coverage" in page
+    with open_dataset(campaign / "kart.zarr") as dataset:
+        assert dataset.attrs["checksum"] in page
 
 
 @pytest.fixture
