@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -89,13 +89,8 @@ def cascade(evaluation: Evaluation) -> list[Entry]:
     return []
 
 
-def shown_states(time: NDArray[np.float64], shares: Sequence[float] = SHARES) -> list[int]:
-    """The states nearest to `shares` of the way from the first to the last time, each once."""
-    wanted = [int(np.argmin(abs(time - time[0] - share * (time[-1] - time[0])))) for share in shares]
-    return list(dict.fromkeys(wanted))
-
-
 def select(evaluation: Evaluation) -> Contributions | None:
+    from evaluation.pictures import states_at
     from evaluation.rendering import rendering_problem
 
     rows = cascade(evaluation)
@@ -104,7 +99,7 @@ def select(evaluation: Evaluation) -> Contributions | None:
     reference = evaluation.reference
     errors = evaluation.scores[rows[-1].label].of_runs
     typical = evaluation.split.test[int(np.argsort(errors, kind="stable")[(len(errors) - 1) // 2])]
-    states = shown_states(reference.time)
+    states = list(dict.fromkeys(states_at(reference.time, SHARES)))  # each once
     return Contributions(
         reference.runs[typical],
         reference.position_of(typical),
