@@ -63,7 +63,7 @@ NETWORKS = ("mh", "podnn", "aenn", "gaenn")  # trained by epochs
 CURVES = (MH, PODNN, POD_GPR)
 
 # What else was tried, on the coarsest level and judged on validation runs alone.
-COARSEST = (*COMMON, "levels=[3]", "level.epochs=40")
+COARSEST = ("level.epochs=40", *COMMON[1:], "levels=[3]")
 ALTERNATIVES = (
     Kind("as-in-the-table", "mh", COARSEST),
     Kind("twice-the-epochs", "mh", (*COARSEST, "level.epochs=80")),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +10,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from plan import ALTERNATIVES, CURVES, MH, NETWORKS, POD_GPR, RUNS, SIZES, TABLE, TRAIN, Job, Kind, alone, quick
+from plan import (
+    ALTERNATIVES,
+    COARSEST,
+    CURVES,
+    MH,
+    NETWORKS,
+    POD_GPR,
+    RUNS,
+    SIZES,
+    TABLE,
+    TRAIN,
+    Job,
+    Kind,
+    alone,
+    quick,
+)
 from rigid import cross_validated
 
 import crashkit
@@ -24,6 +40,7 @@ PAPER = {
     "PODNN": (1.57, None, 0.024), "AENN": (0.64, 7.75, 0.035), "GAENN": (1.65, 312.8, 0.907),
     "MH3": (0.62, 1.96, 0.053), "MH2": (0.49, 4.10, 0.106), "MH1": (0.49, 20.2, 0.381),
 }  # fmt: skip
+KINDS = ("approximation", "reconstruction")
 MEAN, MEAN_OF_BOTH = "MH1, seeds averaged", "MH1 and POD-GPR, seeds averaged"
 SHOWN = ("model", "seeds", "error_cm", "spread_cm", "relative", "worst_run_cm", "reduction_cm", "lifting_cm", "parameters",
          "prediction_ms", "prediction_lifted_ms")  # fmt: skip
@@ -101,8 +118,9 @@ def alternatives(home: Path) -> Columns:
     for kind in ALTERNATIVES:
         record = crashkit.load_model(home / Job(kind).folder).record
         own, reduction = (100 * record.errors.get(name, np.nan) for name in ("MH3", "MH3, reduction alone"))
-        rows.append((kind.name, own, reduction, record.fits[3].seconds, " ".join(kind.settings)))
-    return _columns(("alternative", "validation_error_cm", "reduction_cm", "training_s", "settings"), rows)
+        different = [setting for setting in kind.settings if setting not in COARSEST]
+        rows.append((kind.name, own, reduction, " ".join(different) or "-"))
+    return _columns(("alternative", "validation_error_cm", "reduction_cm", "what_differs"), rows)
 
 
 def goals(errors: dict[str, float]) -> Columns:
@@ -130,6 +148,17 @@ def timed_alone(home: Path, rows: Sequence[Mapping[str, Any]], shape: Callable[[
             whole[name] = total
     names = [row["model"].split(" ")[0] for row in rows]
     return {"seconds_per_epoch": [each.get(n) for n in names], "training_s": [whole[n] for n in names]}
+
+
+def on_coarse_meshes(levels: Path) -> Columns:
+    """Errors, cm, on the nodes of each coarse level: of the cascade's own model there, and of what works on the full mesh."""
+    with levels.open(encoding="utf-8", newline="") as file:
+        rows = [
+            (int(row["nodes"]), row["model"], *(float(row[f"{kind}_cm"] or "nan") for kind in KINDS))
+            for row in csv.DictReader(file)
+            if row["level"] != "0" and (row["prediction_is"] == "own" or not row["model"].startswith("MH"))
+        ]
+    return _columns(("nodes", "model", *(f"{kind}_cm" for kind in KINDS)), sorted(rows, key=lambda row: -row[0]))
 
 
 def markdown(columns: Columns) -> str:
@@ -170,6 +199,7 @@ def write_results(data: Path, home: Path, seeds: int, short: bool) -> list[Path]
     }
     if not short:
         tables |= {"alternatives": alternatives(home), "rigid": cross_validated(data)}
+    tables["coarse"] = on_coarse_meshes(home / "report" / "figures" / "levels.csv")
     paths = []
     for name, columns in tables.items():
         paths += [folder / f"{name}.csv", folder / f"{name}.md"]

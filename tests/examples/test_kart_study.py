@@ -50,7 +50,7 @@ def test_a_quick_study_leaves_report_tables_and_curves_and_does_nothing_twice(mo
     monkeypatch.setattr(sys, "argv", ["study.py", str(demo_data()), "-o", str(tmp_path / "s"), "--quick"])
     study.main()
     results = tmp_path / "s" / "results"
-    assert {p.stem for p in results.glob("*.md")} == {"table", "paper", "averaged", "goals"}
+    assert {p.stem for p in results.glob("*.md")} == {"table", "coarse", "paper", "averaged", "goals"}
     curves = (results / "learning_curves.csv").read_text().splitlines()
     assert [line.rsplit(",", 1)[0] for line in curves[1:]] == ["POD-GPR,6", "POD-GPR,27"]
     assert (tmp_path / "s" / "report" / "report.html").stat().st_size > 100_000
