@@ -126,8 +126,35 @@ def decode(
 
     dense    W (node * channel, latent) and b (node * channel); the others as in `encode`
     """
-    out = _Decode.apply(z, operator, tuple(elus), *dense, *weights, *biases)
-    return out if torch.is_grad_enabled() else out.transpose(1, 2).contiguous().transpose(1, 2)
+    if not torch.is_grad_enabled():
+        return _predict(z, operator, tuple(elus), *dense, *weights, *biases)
+    return _Decode.apply(z, operator, tuple(elus), *dense, *weights, *biases)
+
+
+def _predict(
+    z: Tensor, operator: GraphOperator, elus: tuple[bool, ...], weight: Tensor, bias: Tensor, *parameters: Tensor
+) -> Tensor:
+    """`decode` without a gradient: each thread takes one block after the other through the same room.
+
+    What lies between the layers is then never the size of a whole run; getting that memory cost more than computing.
+    """
+    batch, blocks = len(z), _latent_blocks(z)
+    size, latent = weight.shape
+    weight, bias = weight.contiguous(), bias.contiguous()
+    n, channels = operator.n_nodes, parameters[len(elus) - 1].shape[2]
+    out = z.new_empty(len(blocks), n, channels, LANES)
+    expand = _function("expand", z.dtype)
+
+    def share(first: int, last: int) -> None:
+        h = z.new_empty(1, size, LANES)
+        stack = _Stack(operator, h.unflatten(1, (n, -1)), elus, parameters)
+        addresses = (weight.data_ptr(), latent, 1, bias.data_ptr())
+        for block in range(first, last):
+            expand(0, size, 1, size, latent, *addresses, blocks[block].data_ptr(), h.data_ptr())
+            stack.forward_into(out[block])
+
+    _share(len(blocks), LANES * max(size, n * channels), share)
+    return out.permute(1, 2, 0, 3).reshape(n, channels, -1)[..., :batch].contiguous().transpose(1, 2)
 
 
 class _Encode(torch.autograd.Function):
@@ -243,6 +270,11 @@ class _Stack:
         run, ends = _function("stack_forward", self.x.dtype), (ctypes.byref(self.graph), len(self.layers), self.layers)
         _share(len(self.x), self.widest, lambda first, last: run(*ends, first, last))
         return self.y
+
+    def forward_into(self, y: Tensor) -> None:
+        """The result for the only block, put into y (node, out, 16)."""
+        self.layers[-1].y = y.data_ptr()
+        _function("stack_forward", self.x.dtype)(ctypes.byref(self.graph), len(self.layers), self.layers, 0, 1)
 
     def backward(self, by_y: Tensor, need_x: bool) -> tuple[Tensor | None, list[Tensor]]:
         """The gradients by x, if needed, and by the parameters."""

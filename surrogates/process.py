@@ -57,9 +57,13 @@ class LatentProcess(nn.Module):
             self.register_buffer(name, torch.zeros(shape))
 
     def forward(self, inputs: Tensor) -> Tensor:
-        weights = self._kernel(inputs[:, : self.runs.shape[1]])
         place, parts = self._stencil(inputs[:, self.runs.shape[1]])
+        parameters = inputs[:, : self.runs.shape[1]]
+        one_run = _alike(parameters)
+        weights = self._kernel(parameters[:1] if one_run else parameters)
         courses = self.mean + (weights @ self.pull.flatten(1)).unflatten(1, self.mean.shape)
+        if one_run:
+            courses = courses.expand(len(inputs), -1, -1)
         out = torch.zeros_like(self.mean[:1])
         for k, part in enumerate(parts):
             at = (place + (k - 1)).clamp(0, len(self.time) - 1)
@@ -98,6 +102,13 @@ class LatentProcess(nn.Module):
         """An empty one with room for stored `tensors`."""
         runs, states, latent = tensors["pull"].shape
         return cls(runs, tensors["runs"].shape[1], states, latent)
+
+
+def _alike(rows: Tensor) -> bool:
+    """Whether, in a prediction, all rows are equal, as for the states of one run; its course is then computed once."""
+    if torch.is_grad_enabled() or torch.compiler.is_compiling():
+        return False
+    return bool((rows == rows[:1]).all())
 
 
 def fit_process(
