@@ -225,7 +225,7 @@ _FAST: dict[str, Any] = {
         "batch": 64,
         "learning_rate": 4e-3,
         "schedule": "one_cycle",
-        "weight_decay": 1e-4,
+        "weight_decay": 0.1,
         "rate_inputs": 16,
         "regression": "auto",
     },
