@@ -29,9 +29,9 @@ import torch
 
 from crashkit.cli.train import train
 from surrogates.config import settings
+from surrogates.loop import Epoch
 from surrogates.model import Surrogate
 from surrogates.storage import load
-from surrogates.training import Epoch
 
 GOAL = 10.0
 DEMO_NODES, DEMO_TEST = [300, 75, 19], "27:36"

@@ -19,10 +19,10 @@ from surrogates.data import Campaign
 from surrogates.errors import SurrogateError
 from surrogates.graphs import Graphs
 from surrogates.inputs import Ranges
+from surrogates.loop import Fit
 from surrogates.network import Network
 from surrogates.pod_regression import PodRegression
 from surrogates.samples import Split
-from surrogates.training import Fit
 from surrogates.uncertainty import Band
 
 # Samples predicted at once.

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from surrogates.errors import SurrogateError
 from surrogates.level import Known, Level
+from surrogates.loop import Objective
 from surrogates.reduction import linear_part
-from surrogates.training import Objective
 from surrogates.unified import Unified
 
 # Samples handled at once outside training.

@@ -14,12 +14,12 @@ from surrogates.data import Campaign
 from surrogates.errors import Diverged, SurrogateError
 from surrogates.graphs import Graphs
 from surrogates.inputs import InputScaling, Ranges
+from surrogates.loop import Epoch, Fit, Keeper, device_of
 from surrogates.model import Record, Surrogate
 from surrogates.pod_regression import fit_pod_regression
 from surrogates.refinement import Refined
 from surrogates.samples import Notes, Runs, check, split
 from surrogates.trainer import Trainer
-from surrogates.training import Epoch, Fit, Keeper, device_of
 from surrogates.uncertainty import FEWEST_RUNS, calibrate
 from surrogates.unified import Unified
 

@@ -16,13 +16,13 @@ from surrogates.data import Campaign
 from surrogates.graphs import Graphs
 from surrogates.inputs import InputScaling
 from surrogates.level import Level
+from surrogates.loop import Epoch, Fit, Keeper, Objective, fit, set_up
 from surrogates.model import Surrogate, level_name
 from surrogates.objectives import CHUNK, LatentObjective, LevelObjective, Samples, UnifiedObjective, as_states
 from surrogates.process import mix_in
 from surrogates.reduction import LinearReduction, LinearStart, linear_part
 from surrogates.samples import Notes, Runs, Split, scale_of
 from surrogates.starts import pod_start, start_level, start_unified
-from surrogates.training import Epoch, Fit, Keeper, Objective, fit, set_up
 from surrogates.unified import Unified
 
 

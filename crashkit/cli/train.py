@@ -14,8 +14,8 @@ from crashkit.cli._console import print_json, progress, say, table
 if TYPE_CHECKING:
     from surrogates.config import Settings
     from surrogates.data import Campaign
+    from surrogates.loop import Epoch
     from surrogates.model import Surrogate
-    from surrogates.training import Epoch
 
 
 def train(

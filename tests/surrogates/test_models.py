@@ -14,10 +14,10 @@ from surrogates.cascade import Cascade
 from surrogates.checkpoints import Checkpoints
 from surrogates.config import settings
 from surrogates.errors import Diverged, SurrogateError
+from surrogates.loop import Epoch
 from surrogates.model import Surrogate
 from surrogates.storage import load, save
 from surrogates.train import train
-from surrogates.training import Epoch
 
 SHORT = ("level.epochs=4", "transfer.epochs=1", "level.batch=16")
 
