@@ -45,12 +45,17 @@ def test_at_trained_times_it_is_the_gaussian_process_of_whole_courses() -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
-def test_one_run_costs_one_course_and_gives_what_any_batch_gives() -> None:
+def test_one_run_costs_one_course_and_gives_what_any_batch_gives(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    kernel = LatentProcess._kernel
+    monkeypatch.setattr(LatentProcess, "_kernel", lambda self, x: asked.append(len(x)) or kernel(self, x))
     query = at(np.repeat([[0.3, -0.2]], 5, axis=0), TIME)
     other = at(np.array([[0.5, 0.5]]), TIME[:1])
+    process = fitted()
     with torch.no_grad():
-        alone, among = fitted()(query), fitted()(torch.cat([query, other]))[:5]
+        alone, among = process(query), process(torch.cat([query, other]))[:5]
     torch.testing.assert_close(alone, among, rtol=1e-12, atol=1e-12)
+    assert asked == [1, 6]
 
 
 def test_between_trained_times_it_is_a_cubic_hermite_spline_and_held_outside() -> None:
