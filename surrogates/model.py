@@ -262,7 +262,7 @@ class Surrogate:
         return level
 
     def checked(self, parameters: ArrayLike, time: ArrayLike | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Parameters as (batch, p) and times (state,); raises SurrogateError unless finite and of the right number."""
+        """Parameters as (batch, p) and times (state,); raises SurrogateError unless some, finite and of the right number."""
         values = np.atleast_2d(np.asarray(parameters, np.float64))
         names = self.record.ranges.names
         if values.ndim != 2 or values.shape[1] != len(names):
@@ -270,6 +270,10 @@ class Surrogate:
                 f"parameters have the shape {np.shape(parameters)}; expected ({len(names)},) or (batch, {len(names)}): {', '.join(names)}"
             )
         times = self.record.time if time is None else np.atleast_1d(np.asarray(time, np.float64))
+        if not len(values) or not len(times):
+            raise SurrogateError(
+                f"{len(values)} sets of parameters and {len(times)} times were asked for; expected at least one of each"
+            )
         if not np.isfinite(values).all() or not np.isfinite(times).all():
             raise SurrogateError("parameters and times must be finite numbers; found NaN or infinity")
         return values, times

@@ -181,6 +181,7 @@ def test_lifting_is_the_static_upsampling() -> None:
         ),
         (lambda s: s.predict([1.0, 2.0]), r"expected \(3,\).*impact_speed, impact_angle, yield_stress"),
         (lambda s: s.predict([1.0, np.nan, 2.0]), "must be finite"),
+        (lambda s: s.predict([1.0, 1.0, 2.0], []), "0 times were asked for"),
         (lambda s: s.reconstruct(np.zeros((2, 7, 3))), "expected .state, 25 nodes, 3"),
     ],
 )
