@@ -13,6 +13,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from crashkit.errors import CrashkitError, ReadError
+from crashkit.readers._checks import is_damaged_hdf5
 from crashkit.readers.base import Reader
 
 ENTRY_POINT_GROUP = "crashkit.readers"
@@ -58,7 +59,6 @@ def reader_for(path: Path, name: str | None = None) -> Reader:
     for reader in known.values():
         if reader.sniff(path):
             return reader
-    raise ReadError(
-        f"{path}: the content is none of the known formats ({', '.join(sorted(known))}); "
-        "check the path, or name the format with --reader"
-    )
+    damaged = "it begins like an HDF5 file and cannot be opened as one, so it was cut short or damaged: copy it again"
+    advice = damaged if is_damaged_hdf5(path) else "check the path, or name the format with --reader"
+    raise ReadError(f"{path}: the content is none of the known formats ({', '.join(sorted(known))}); {advice}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,3 +77,16 @@ def require_options(reader: str, options: Mapping[str, object], known: Sequence[
         if value is not None and name not in known:
             ours = f"its options are {', '.join(known)}" if known else "it has no options"
             raise CrashkitError(f"reader {reader!r} has no option {name!r}; {ours}")
+
+
+def is_damaged_hdf5(path: Path) -> bool:
+    """Whether a file has the signature of HDF5 and still cannot be opened; several formats lie in such files."""
+    import h5py
+
+    if not path.is_file() or not h5py.is_hdf5(path):
+        return False
+    try:
+        with h5py.File(path, "r"):
+            return False
+    except LIBRARY_ERRORS:
+        return True
