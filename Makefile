@@ -22,6 +22,7 @@ check: $(READY)
 
 # Installed again only when what is to be installed has changed.
 $(READY): pyproject.toml constraints.txt surrogates/_convolution.c
+	@echo "Making the environment in $(VENV), once: some minutes and no output."
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	touch $@
