@@ -161,7 +161,7 @@ def _write_levels(folder: Path, hierarchy: Hierarchy, mesh: MeshArrays) -> list[
 
 def _draw(picture: Path, hierarchy: Hierarchy, mesh: MeshArrays, levels: list[dict[str, Any]]) -> bool:
     """Draw the picture; where this machine cannot, say so and go on, since the hierarchy is what was asked for."""
-    from evaluation.rendering import rendering_problem
+    from evaluation.drawing.rendering import rendering_problem
 
     problem = rendering_problem()
     if problem is not None:
@@ -183,7 +183,7 @@ def draw_levels(
     from matplotlib.figure import Figure
 
     from crashkit.mesh.probe import without_sides
-    from evaluation.rendering import choose_view, render
+    from evaluation.drawing.rendering import choose_view, render
 
     with _output(picture):
         picture.parent.mkdir(parents=True, exist_ok=True)

@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
-    from evaluation.predictor import Mesh, Model
-    from evaluation.reference import Reference
-    from evaluation.result import Evaluation
-    from evaluation.scoring import RunScores
-    from evaluation.sensors import Sensors
+    from evaluation.comparison.predictor import Mesh, Model
+    from evaluation.comparison.reference import Reference
+    from evaluation.comparison.result import Evaluation
+    from evaluation.comparison.scoring import RunScores
+    from evaluation.comparison.sensors import Sensors
     from surrogates.model import Surrogate
 
 Progress = Callable[[str, int, int], None]  # what is being done, steps done, steps in all
@@ -63,14 +63,14 @@ def evaluate(
     ReadError and ModelFolderError where files are not what they should be, OutputError where `output` cannot be
     written.
     """
-    from evaluation.comparison import agree_on_split, entries
+    from crashkit.output import complete_folder
+    from evaluation.comparison.result import compare, decompose
+    from evaluation.comparison.sensors import choose_sensors
+    from evaluation.comparison.split import agree_on_split, entries
+    from evaluation.comparison.streaming import over_runs
     from evaluation.figures import kinds
-    from evaluation.files import default_runs, write_run
-    from evaluation.output import complete_folder
-    from evaluation.report import write_report
-    from evaluation.result import compare, decompose
-    from evaluation.sensors import choose_sensors
-    from evaluation.streaming import over_runs
+    from evaluation.report.files import default_runs, write_run
+    from evaluation.report.report import write_report
 
     tell = report or (lambda what, done, total: None)
     paths = (str(dataset), tuple(map(str, models)))
@@ -138,8 +138,8 @@ class ScoreJob:
     def __call__(self, run: int) -> RunScores:
         import numpy as np
 
-        from evaluation.result import default_groups, predictors_of
-        from evaluation.scoring import score_run
+        from evaluation.comparison.result import default_groups, predictors_of
+        from evaluation.comparison.scoring import score_run
 
         evaluation = self.modes[0]  # a folder of its own, so its path names the evaluation
         if evaluation not in _HELD:
@@ -168,7 +168,7 @@ def _opened(dataset: str, models: tuple[str, ...]) -> tuple[Reference, tuple[Mod
     from crashkit.cli.predict import load_model
     from crashkit.dataset import has_hierarchy, open_dataset
     from crashkit.mesh.store import read_hierarchy
-    from evaluation.reference import reference_of
+    from evaluation.comparison.reference import reference_of
 
     surrogates = [(Path(folder), load_model(folder)) for folder in models]
     opened = open_dataset(dataset, chunks=None)
@@ -203,7 +203,7 @@ def _reader(path: str, dataset: xr.Dataset) -> Callable[[int], NDArray[np.float3
 
 @dataclass
 class StoredLevel:
-    """One level of a stored surrogate as evaluation asks it (evaluation.predictor.Predictor).
+    """One level of a stored surrogate as evaluation asks it (evaluation.comparison.predictor.Predictor).
 
     order  for each parameter of the surrogate, its place among those of the dataset
     """
@@ -235,8 +235,8 @@ def as_model(surrogate: Surrogate, folder: Path, reference: Reference) -> Model:
 
     Raises EvaluationError where its parameters, nodes or levels are not those of the dataset.
     """
+    from evaluation.comparison.predictor import Model
     from evaluation.errors import EvaluationError
-    from evaluation.predictor import Model
 
     names = surrogate.record.ranges.names
     if sorted(names) != sorted(reference.parameter_names):
@@ -378,8 +378,8 @@ def command(
     from dataclasses import asdict
 
     from crashkit.dataset import open_dataset
-    from evaluation.tables import performance
-    from evaluation.verdict import statements
+    from evaluation.report.tables import performance
+    from evaluation.report.verdict import statements
 
     names = tuple(map(str, open_dataset(dataset)["sim"].values)) if test or vtk_runs else ()
     with progress() as bar:

@@ -124,7 +124,7 @@ def command(
     with open_dataset(path, chunks=None) as dataset, reading(path):
         found = describe(dataset, path)
         if report is not None:
-            from evaluation.datacard import write_card
+            from evaluation.report.datacard import write_card
 
             with progress() as bar:
                 task = bar.add_task("runs", total=dataset.sizes["sim"], note="")

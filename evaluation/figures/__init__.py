@@ -20,7 +20,7 @@ from evaluation.figures.kind import Drawing, Kind
 from evaluation.figures.style import Sheet, styles
 
 if TYPE_CHECKING:
-    from evaluation.result import Evaluation
+    from evaluation.comparison.result import Evaluation
 
 # The order in which a reader wants them: how good, where not, why, at what price, on which data.
 ORDER = (

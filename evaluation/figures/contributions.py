@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from evaluation.figures.kind import Columns, Kind
 from evaluation.figures.style import CM, MS, Sheet, called
-from evaluation.files import contributions
+from evaluation.report.files import contributions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from evaluation.comparison import Entry
-    from evaluation.result import Evaluation
+    from evaluation.comparison.result import Evaluation
+    from evaluation.comparison.split import Entry
 
 SHARES = (1 / 3, 2 / 3, 1.0)
 
@@ -46,7 +46,7 @@ class Contributions:
         return dict(zip(names, zip(*rows, strict=True), strict=True))
 
     def draw(self, sheet: Sheet) -> Figure:
-        from evaluation.pictures import Row, states_picture
+        from evaluation.drawing.pictures import Row, states_picture
 
         sizes = self._sizes()
         rows = [
@@ -90,8 +90,8 @@ def cascade(evaluation: Evaluation) -> list[Entry]:
 
 
 def select(evaluation: Evaluation) -> Contributions | None:
-    from evaluation.pictures import states_at
-    from evaluation.rendering import rendering_problem
+    from evaluation.drawing.pictures import states_at
+    from evaluation.drawing.rendering import rendering_problem
 
     rows = cascade(evaluation)
     if not rows or rendering_problem() is not None:

@@ -14,7 +14,7 @@ from evaluation.figures.style import Sheet, look, readable, span
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from evaluation.result import Evaluation
+    from evaluation.comparison.result import Evaluation
 
 _TRAIN, _TEST = "#0072B2", "#D55E00"
 

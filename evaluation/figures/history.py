@@ -15,7 +15,7 @@ from evaluation.figures.style import Sheet, smoothed
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from evaluation.result import Evaluation
+    from evaluation.comparison.result import Evaluation
 
 _LOSSES = ("total", "approximation", "reconstruction")
 

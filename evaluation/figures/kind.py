@@ -15,7 +15,7 @@ from evaluation.figures.style import Sheet, look
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from evaluation.result import Evaluation
+    from evaluation.comparison.result import Evaluation
 
 Columns = Mapping[str, Sequence[Any]]
 

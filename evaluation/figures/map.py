@@ -15,7 +15,7 @@ from evaluation.figures.style import CM, Sheet, look
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from evaluation.result import Evaluation
+    from evaluation.comparison.result import Evaluation
 
 _LISTED = 100
 _SHOWN = 4
@@ -41,8 +41,8 @@ class ErrorMap:
         return columns
 
     def draw(self, sheet: Sheet) -> Figure:
-        from evaluation.pictures import ERROR, PIXELS_PER_CM
-        from evaluation.rendering import choose_view, render
+        from evaluation.drawing.pictures import ERROR, PIXELS_PER_CM
+        from evaluation.drawing.rendering import choose_view, render
 
         with look():
             columns = min(2, len(self.errors))
@@ -84,7 +84,7 @@ class ErrorMap:
 
 
 def select(evaluation: Evaluation) -> ErrorMap | None:
-    from evaluation.rendering import rendering_problem
+    from evaluation.drawing.rendering import rendering_problem
 
     if rendering_problem() is not None:
         return None

@@ -16,7 +16,7 @@ from evaluation.figures.style import CM, Sheet
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from evaluation.result import Evaluation
+    from evaluation.comparison.result import Evaluation
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Meshes:
         }
 
     def draw(self, sheet: Sheet) -> Figure:
-        from evaluation.pictures import KeptNodes, kept_nodes_picture
+        from evaluation.drawing.pictures import KeptNodes, kept_nodes_picture
 
         rows = [KeptNodes(f"level {level.index}", level.kept, level.faces, level.edges) for level in self.levels]
         return kept_nodes_picture(self.position, self.faces, rows, sheet)
@@ -53,7 +53,7 @@ class Meshes:
 
 
 def select(evaluation: Evaluation) -> Meshes | None:
-    from evaluation.rendering import rendering_problem
+    from evaluation.drawing.rendering import rendering_problem
 
     reference = evaluation.reference
     if not reference.levels or rendering_problem() is not None:

@@ -15,7 +15,7 @@ from evaluation.figures.style import CM, FAINT, Sheet, leading, readable, span
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from evaluation.result import Evaluation
+    from evaluation.comparison.result import Evaluation
 
 _SHOWN = 6
 

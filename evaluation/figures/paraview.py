@@ -14,7 +14,7 @@ from evaluation.figures.style import Sheet
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from evaluation.result import Evaluation
+    from evaluation.comparison.result import Evaluation
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class FromFile:
         }
 
     def draw(self, sheet: Sheet) -> Figure:
-        from evaluation.pictures import file_picture
+        from evaluation.drawing.pictures import file_picture
 
         return file_picture(self.path, name=self.model, sheet=sheet)
 
@@ -53,8 +53,8 @@ class FromFile:
 
 
 def select(evaluation: Evaluation) -> FromFile | None:
-    from evaluation.files import file_name
-    from evaluation.rendering import rendering_problem
+    from evaluation.drawing.rendering import rendering_problem
+    from evaluation.report.files import file_name
 
     best = evaluation.ranked[0]
     ending = file_name(evaluation.model(best).name)

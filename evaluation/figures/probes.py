@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evaluation.curves import Curve, curves, shown, unit
 from evaluation.figures.kind import Columns, Kind
 from evaluation.figures.style import INK, MS, Sheet, called, leading
+from evaluation.measures.curves import Curve, curves, shown, unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from evaluation.result import Evaluation
+    from evaluation.comparison.result import Evaluation
 
 _SHOWN = 4
 

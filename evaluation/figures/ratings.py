@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.curves import grade
 from evaluation.figures.kind import Columns, Kind
 from evaluation.figures.style import FAINT, Sheet
-from evaluation.measures import masked_mean
-from evaluation.probes import GRADES
+from evaluation.measures.curves import grade
+from evaluation.measures.distance import masked_mean
+from evaluation.measures.probes import GRADES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from evaluation.result import Evaluation
+    from evaluation.comparison.result import Evaluation
 
 
 @dataclass(frozen=True)

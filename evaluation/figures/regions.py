@@ -9,7 +9,7 @@ from evaluation.figures.kind import Kind
 from evaluation.figures.parts import ErrorOfGroups, groups_of
 
 if TYPE_CHECKING:
-    from evaluation.result import Evaluation
+    from evaluation.comparison.result import Evaluation
 
 
 def select(evaluation: Evaluation) -> ErrorOfGroups | None:

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from evaluation.figures.kind import Columns, Kind
 from evaluation.figures.style import CM, FAINT, INK, MS, Sheet
-from evaluation.measures import masked_mean
+from evaluation.measures.distance import masked_mean
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from evaluation.result import Evaluation
+    from evaluation.comparison.result import Evaluation
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from evaluation.figures.style import INK, Sheet
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from evaluation.result import Evaluation
+    from evaluation.comparison.result import Evaluation
 
 _SHADES = (INK, "#0072B2", "#56B4E9", "#009E73", "#E69F00", "#CC79A7")
 

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from evaluation.figures.kind import Columns, Kind
 from evaluation.figures.style import CM, MS, Sheet, called
-from evaluation.measures import masked_mean
+from evaluation.measures.distance import masked_mean
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from evaluation.result import Evaluation
+    from evaluation.comparison.result import Evaluation
 
 _LISTED = 100
 
@@ -48,7 +48,7 @@ class WorstState:
         }
 
     def draw(self, sheet: Sheet) -> Figure:
-        from evaluation.pictures import comparison_picture
+        from evaluation.drawing.pictures import comparison_picture
 
         return comparison_picture(
             self.position, self.faces, self.truth, self.prediction, self.model, sheet, alive=self.alive
@@ -68,7 +68,7 @@ class WorstState:
 
 
 def select(evaluation: Evaluation) -> WorstState | None:
-    from evaluation.rendering import rendering_problem
+    from evaluation.drawing.rendering import rendering_problem
 
     if rendering_problem() is not None:
         return None

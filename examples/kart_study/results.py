@@ -33,7 +33,7 @@ import crashkit
 from data_schema import parameters
 from evaluation.figures import Sheet, styles
 from evaluation.figures.kind import Columns, to_csv, write
-from evaluation.measures import mean_node_error, node_distance
+from evaluation.measures.distance import mean_node_error, node_distance
 
 # Mean node error on the full mesh, cm, seconds an epoch and ms a prediction, of the paper's own kart (its table 4):
 # another mesh, other loads and an Apple M1 Max, so to be read by its ratios.

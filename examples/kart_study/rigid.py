@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 import crashkit
 from crashkit.mesh.store import level_displacement
 from data_schema import parameters
-from evaluation.rigid import RigidMotion, fit_rigid
+from evaluation.measures.rigid import RigidMotion, fit_rigid
 from surrogates.pod import pod
 from surrogates.pod_regression import Gaussian
 

@@ -12,11 +12,11 @@ from toy import NearestPod
 
 from crashkit.dataset import demo_data
 from crashkit.mesh.hierarchy import build_hierarchy
-from evaluation.comparison import agree_on_split
-from evaluation.predictor import Model
-from evaluation.reference import Reference
-from evaluation.result import Evaluation, compare
-from evaluation.sensors import choose_sensors
+from evaluation.comparison.predictor import Model
+from evaluation.comparison.reference import Reference
+from evaluation.comparison.result import Evaluation, compare
+from evaluation.comparison.sensors import choose_sensors
+from evaluation.comparison.split import agree_on_split
 
 TRAIN, TEST = range(9), range(9, 12)
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evaluation import tables
-from evaluation.comparison import Split
-from evaluation.result import compare
-from evaluation.scoring import score_run
+from evaluation.comparison.result import compare
+from evaluation.comparison.scoring import score_run
+from evaluation.comparison.split import Split
+from evaluation.report import tables
 
 
 class WithBand:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from evaluation.comparison import agree_on_split, entries
+from evaluation.comparison.split import agree_on_split, entries
 from evaluation.errors import EvaluationError
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from crashkit.errors import OutputError
-from evaluation.datacard import card_drawings, card_statements, summarise, surprise, write_card
 from evaluation.figures.outliers import robust_score
+from evaluation.report.datacard import card_drawings, card_statements, summarise, surprise, write_card
 
 
 def test_the_card_is_complete(reference, tmp_path):

@@ -51,7 +51,7 @@ def campaign(tmp_path_factory) -> Path:
 def small(monkeypatch):
     """The report with two figures only: what it looks like is tested elsewhere."""
     monkeypatch.setattr("evaluation.figures.ORDER", ("error_over_time", "floors"))
-    monkeypatch.setattr("evaluation.report._views", lambda evaluation: ([], ""))
+    monkeypatch.setattr("evaluation.report.report._views", lambda evaluation: ([], ""))
 
 
 def run(*arguments: object):
@@ -228,7 +228,7 @@ def test_an_evaluation_that_breaks_off_leaves_nothing(campaign, tmp_path, monkey
     def broken(*arguments, **options):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("evaluation.report.render_page", broken)
+    monkeypatch.setattr("evaluation.report.report.render_page", broken)
     monkeypatch.setattr("evaluation.figures.ORDER", ("floors",))
     _fails(run(campaign / "kart.zarr", campaign / "podnn", "-o", tmp_path / "report"), "No space left on device")
     assert list(tmp_path.iterdir()) == []

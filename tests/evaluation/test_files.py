@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import pyvista as pv
 
-from evaluation.files import coarsest_level, contributions, default_runs, file_name, lone_edges, write_run
+from evaluation.report.files import coarsest_level, contributions, default_runs, file_name, lone_edges, write_run
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ import zlib
 import numpy as np
 import pytest
 
+from evaluation.drawing.interactive import interactive_view
 from evaluation.errors import EvaluationError
-from evaluation.interactive import interactive_view
 
 TIME = np.linspace(0, 0.03, 12)
 

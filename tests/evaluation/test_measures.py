@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from scipy import sparse
 
 from evaluation.errors import EvaluationError
-from evaluation.measures import (
+from evaluation.measures.distance import (
     group_error,
     largest_node_error,
     lift,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from crashkit.errors import OutputError
-from evaluation.output import complete_folder
+from crashkit.output import complete_folder
 
 
 def test_an_earlier_result_is_replaced_as_a_whole(tmp_path):

@@ -11,9 +11,7 @@ import pytest
 from PIL import Image
 
 from crashkit.paraview import write_paraview
-from evaluation.errors import EvaluationError
-from evaluation.figures.style import Sheet
-from evaluation.pictures import (
+from evaluation.drawing.pictures import (
     KeptNodes,
     Row,
     comparison_picture,
@@ -25,6 +23,8 @@ from evaluation.pictures import (
     states_picture,
     to_png,
 )
+from evaluation.errors import EvaluationError
+from evaluation.figures.style import Sheet
 
 SHEET = Sheet(13.0)
 
@@ -32,7 +32,7 @@ SHEET = Sheet(13.0)
 @pytest.fixture(autouse=True)
 def _small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Coarse images: drawing without a graphics card takes time."""
-    monkeypatch.setattr("evaluation.pictures.PIXELS_PER_CM", 25)
+    monkeypatch.setattr("evaluation.drawing.pictures.PIXELS_PER_CM", 25)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evaluation.errors import EvaluationError
-from evaluation.pod import StreamedPod, held, projection_error
+from evaluation.measures.pod import StreamedPod, held, projection_error
 
 
 def _runs(seed: int, count: int, states: int = 4, nodes: int = 7) -> list[np.ndarray]:

@@ -10,7 +10,7 @@ from scipy.signal import butter
 from scipy.spatial.transform import Rotation
 
 from evaluation.errors import EvaluationError
-from evaluation.probes import (
+from evaluation.measures.probes import (
     CFC_CLASSES,
     cfc_coefficients,
     cfc_filter,

@@ -8,7 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaluation.errors import EvaluationError
-from evaluation.regions import by_grid, by_part, by_thirds, error_by_group, living_nodes, masked, named, worst_of
+from evaluation.measures.regions import (
+    by_grid,
+    by_part,
+    by_thirds,
+    error_by_group,
+    living_nodes,
+    masked,
+    named,
+    worst_of,
+)
 
 FACES = np.array([[0, 1, 2, -1], [1, 2, 3, 4], [4, 5, 6, -1]])
 

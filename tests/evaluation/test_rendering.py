@@ -9,8 +9,8 @@ import sys
 import numpy as np
 import pytest
 
+from evaluation.drawing.rendering import choose_view, render, rendering_problem
 from evaluation.errors import EvaluationError
-from evaluation.rendering import choose_view, render, rendering_problem
 
 # A frame-like plate: 4 m along x, 1 m along y, flat in z.
 POINTS = np.array([[x, y, 0.0] for x in range(5) for y in range(2)], float)
@@ -117,7 +117,7 @@ def test_marked_nodes_and_lone_edges_are_drawn_without_faces():
 def test_drawing_without_a_display_says_nothing_on_stderr():
     script = (
         "import numpy as np, sys\n"
-        "from evaluation.rendering import choose_view, render\n"
+        "from evaluation.drawing.rendering import choose_view, render\n"
         "x, f = np.eye(3), np.array([[0, 1, 2]])\n"
         "image = render(x, f, choose_view([x], f), width=50)\n"
         "sys.exit(0 if (image < 250).any() else 3)\n"

@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.comparison import Split, agree_on_split
+from evaluation.comparison.result import compare
+from evaluation.comparison.split import Split, agree_on_split
 from evaluation.figures import ORDER, drawings, kinds, sheet_of
 from evaluation.figures.kind import drawn, image
 from evaluation.figures.style import Sheet, readable, smoothed, styles
-from evaluation.files import write_run
-from evaluation.page import plain, show_table
-from evaluation.report import write_report
-from evaluation.result import compare
+from evaluation.report.files import write_run
+from evaluation.report.page import plain, show_table
+from evaluation.report.report import write_report
 
 PICTURES = ("worst", "map", "contributions", "meshes", "paraview")
 
@@ -61,7 +61,7 @@ def parsed(path: Path) -> _Page:
 @pytest.fixture(scope="module")
 def report(evaluation, tmp_path_factory) -> Iterator[Path]:
     with pytest.MonkeyPatch.context() as small:  # software rendering of large pictures takes most of a minute
-        small.setattr("evaluation.pictures.PIXELS_PER_CM", 12)
+        small.setattr("evaluation.drawing.pictures.PIXELS_PER_CM", 12)
         folder = tmp_path_factory.mktemp("report")
         files = write_run(evaluation, 9, folder / "vtk")
         yield write_report(replace(evaluation, files=tuple(files)), folder, view=False)
@@ -122,7 +122,7 @@ def test_one_test_run_and_one_model_make_a_report(reference, models, tmp_path):
 
 
 def test_where_nothing_can_be_rendered_the_rest_is_there(evaluation, tmp_path, monkeypatch):
-    monkeypatch.setattr("evaluation.rendering.rendering_problem", lambda: "no display here")
+    monkeypatch.setattr("evaluation.drawing.rendering.rendering_problem", lambda: "no display here")
     page = parsed(write_report(evaluation, tmp_path, names=("error_over_time", "worst", "map", "meshes"), view=True))
     assert "figure-error_over_time" in page.ids
     assert "figure-worst" not in page.ids

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from evaluation.errors import EvaluationError
-from evaluation.rigid import fit_rigid, split_error
+from evaluation.measures.rigid import fit_rigid, split_error
 
 coordinate = st.floats(-3, 3)
 turn = st.tuples(*[st.floats(-170, 170)] * 3)

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evaluation.comparison import Split
+from evaluation.comparison.reference import Reference
+from evaluation.comparison.result import compare, decompose, predictors_of
+from evaluation.comparison.scoring import gather, score_run
+from evaluation.comparison.sensors import choose_sensors
+from evaluation.comparison.split import Split
 from evaluation.errors import EvaluationError
-from evaluation.reference import Reference
-from evaluation.result import compare, decompose, predictors_of
-from evaluation.scoring import gather, score_run
-from evaluation.sensors import choose_sensors
 
 
 def test_the_number_in_the_table_is_the_mean_of_means(reference, models, evaluation):
@@ -83,7 +83,7 @@ def test_the_mean_error_of_a_node_is_over_runs_and_states(reference, models, eva
 
 def test_deformation_and_rigid_motion_are_split(reference, evaluation):
     # A rigid shift of the truth is all rigid error and no deformation.
-    from evaluation.sensors import part_error
+    from evaluation.comparison.sensors import part_error
 
     u = reference.displacement(9)
     parted = part_error(reference, 9, u, u + np.float32([0.1, 0, 0]))
@@ -152,7 +152,7 @@ def test_modes_of_each_level_come_from_one_pass(reference):
 
 
 def test_how_many_states_are_handled_at_once_does_not_matter(reference, models, evaluation, monkeypatch):
-    monkeypatch.setattr("evaluation.tally._BLOCK", 1)  # one state at a time
+    monkeypatch.setattr("evaluation.measures.tally._BLOCK", 1)  # one state at a time
     again = score_run(reference, predictors_of(models), 9, {0: evaluation.pods[0].modes}, sensors=evaluation.sensors)
     before = evaluation.runs[0]
     np.testing.assert_allclose(again.size, before.size, rtol=1e-6)
@@ -190,7 +190,7 @@ def test_scoring_holds_one_run_and_some_of_its_states(monkeypatch):
         faces=np.array([[0, 1, 2]]), face_part=np.array([0]), part_names=("all",), node_id=np.arange(nodes),
         part_id=np.array([1]),
     )  # fmt: skip
-    monkeypatch.setattr("evaluation.tally._BLOCK", 12 * nodes)
+    monkeypatch.setattr("evaluation.measures.tally._BLOCK", 12 * nodes)
     sensors = choose_sensors(big)
     tracemalloc.start()
     score_run(big, {(0, 0): Still()}, 0, {0: np.eye(3 * nodes, 2, dtype=np.float32)}, sensors=sensors)

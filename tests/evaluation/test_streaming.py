@@ -7,8 +7,8 @@ import operator
 
 import pytest
 
+from evaluation.comparison.streaming import over_runs
 from evaluation.errors import EvaluationError
-from evaluation.streaming import over_runs
 
 double = functools.partial(operator.mul, 2)
 

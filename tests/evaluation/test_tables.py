@@ -8,9 +8,9 @@ import io
 import numpy as np
 import pytest
 
-from evaluation import tables
 from evaluation.errors import EvaluationError
 from evaluation.figures.kind import to_csv
+from evaluation.report import tables
 
 
 def test_performance_has_a_row_for_each_level_and_baseline(evaluation):

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evaluation.comparison import Split
-from evaluation.result import compare
-from evaluation.verdict import clearly_better, difference, statements
+from evaluation.comparison.result import compare
+from evaluation.comparison.split import Split
+from evaluation.report.verdict import clearly_better, difference, statements
 
 
 def _with_errors(evaluation, **means):

@@ -144,9 +144,9 @@ def test_outputs_that_cannot_be_written_are_told_and_the_hierarchy_is_kept(path:
 def test_a_machine_that_cannot_draw_gets_the_hierarchy_and_the_reason(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import evaluation.rendering
+    import evaluation.drawing.rendering
 
-    monkeypatch.setattr(evaluation.rendering, "rendering_problem", lambda: "no image can be drawn: no EGL")
+    monkeypatch.setattr(evaluation.drawing.rendering, "rendering_problem", lambda: "no image can be drawn: no EGL")
     code, _, err = run(path, "--nodes", "120,30", "--picture", tmp_path / "levels.png")
     assert code == 0
     assert "no image can be drawn" in err

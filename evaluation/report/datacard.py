@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from crashkit.output import complete_folder
+from evaluation.comparison.reference import Reference, reference_of
 from evaluation.errors import EvaluationError
 from evaluation.figures.coverage import Coverage
 from evaluation.figures.envelopes import Envelopes
@@ -22,12 +24,10 @@ from evaluation.figures.kind import Drawing, Kind, to_csv
 from evaluation.figures.outliers import Outliers, robust_score
 from evaluation.figures.singular_values import SingularValues
 from evaluation.figures.style import CM, MS, Sheet, readable
-from evaluation.measures import gone, largest_node_error, mean_node_error, node_distance
-from evaluation.output import complete_folder
-from evaluation.page import Page, plain_json, render_page, show_figure, show_table
-from evaluation.pod import Pod, StreamedPod
-from evaluation.reference import Reference, reference_of
-from evaluation.verdict import Statement
+from evaluation.measures.distance import gone, largest_node_error, mean_node_error, node_distance
+from evaluation.measures.pod import Pod, StreamedPod
+from evaluation.report.page import Page, plain_json, render_page, show_figure, show_table
+from evaluation.report.verdict import Statement
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from evaluation.comparison.predictor import NOMINAL, Banded, Mesh, Predictor
+from evaluation.comparison.reference import Reference
+from evaluation.comparison.sensors import Parted, Sensors, Watched, joined, part_error, watch
 from evaluation.errors import EvaluationError
-from evaluation.measures import Peak, lift, masked_mean, mean_node_error, node_distance
-from evaluation.pod import held, projection_error
-from evaluation.predictor import NOMINAL, Banded, Mesh, Predictor
-from evaluation.reference import Reference
-from evaluation.sensors import Parted, Sensors, Watched, joined, part_error, watch
-from evaluation.tally import Groups, Tally, state_blocks
+from evaluation.measures.distance import Peak, lift, masked_mean, mean_node_error, node_distance
+from evaluation.measures.pod import held, projection_error
+from evaluation.measures.tally import Groups, Tally, state_blocks
 
 Key = tuple[int, int]  # number of the model, number of its predictor
 

@@ -2,7 +2,7 @@
 
 Positions are deformed positions in metres; the caller adds displacement to reference. Images of one figure share
 a `View`, so that what looks displaced is displaced. Everything with text, colour bars and rows of panels is in
-`evaluation.pictures`.
+`evaluation.drawing.pictures`.
 """
 
 from __future__ import annotations

@@ -9,16 +9,25 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluation import tables
-from evaluation.curves import rating_table
+from evaluation.comparison.predictor import Model
+from evaluation.comparison.result import Evaluation
 from evaluation.errors import EvaluationError
 from evaluation.figures import drawings, sheet_of
 from evaluation.figures.kind import Columns, to_csv
 from evaluation.figures.style import CM, called
-from evaluation.page import Page, ShownFigure, ShownTable, ShownView, plain_json, render_page, show_figure, show_table
-from evaluation.predictor import Model
-from evaluation.result import Evaluation
-from evaluation.verdict import RULES, statements
+from evaluation.measures.curves import rating_table
+from evaluation.report import tables
+from evaluation.report.page import (
+    Page,
+    ShownFigure,
+    ShownTable,
+    ShownView,
+    plain_json,
+    render_page,
+    show_figure,
+    show_table,
+)
+from evaluation.report.verdict import RULES, statements
 
 _HEADINGS = {
     "model": "model", "nodes": "nodes", "error_cm": "mean node error (cm)", "spread_cm": "± over seeds (cm)",
@@ -133,7 +142,7 @@ def _ratings(evaluation: Evaluation) -> dict[str, Columns]:
 
 def _views(evaluation: Evaluation) -> tuple[list[ShownView], str]:
     """The worst run of the best model in three dimensions, or why there is no such view."""
-    from evaluation.interactive import interactive_view
+    from evaluation.drawing.interactive import interactive_view
 
     reference = evaluation.reference
     best = evaluation.ranked[0]

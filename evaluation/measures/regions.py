@@ -1,7 +1,7 @@
 """Where errors are: parts, regions of the structure, and the worst run, node and time.
 
 A set of node groups is a `NodeGroups`: parts, boxes of a grid, thirds along the driving direction, or named sets of
-nodes. Errors are distances (state, node) in metres as `evaluation.measures.node_distance` gives them, NaN where a
+nodes. Errors are distances (state, node) in metres as `evaluation.measures.distance.node_distance` gives them, NaN where a
 node is gone.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evaluation.errors import EvaluationError
-from evaluation.measures import masked_mean, mean_node_error, peak_error
+from evaluation.measures.distance import masked_mean, mean_node_error, peak_error
 
 AXES = "xyz"
 

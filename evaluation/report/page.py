@@ -13,7 +13,7 @@ import numpy as np
 
 from evaluation.figures.kind import Drawing, Kind, drawn, image, write
 from evaluation.figures.style import Sheet, readable, span
-from evaluation.verdict import Statement
+from evaluation.report.verdict import Statement
 
 PHONE_WIDTH = 9.0  # cm
 _UNITS = {"_m_per_s": "m/s", "_percent": "%", "_cm": "cm", "_ms": "ms"}  # endings of names of columns

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.errors import EvaluationError
-from evaluation.measures import gone, mean_node_error
-from evaluation.tally import state_blocks
+from evaluation.measures.distance import gone, mean_node_error
+from evaluation.measures.tally import state_blocks
 
 # Rows of the tall matrices handled at once: bounds what is held in float64 beside the basis.
 _BLOCK = 1 << 14

@@ -12,10 +12,10 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from evaluation.comparison.predictor import Model, Predictor
+from evaluation.comparison.reference import Reference
+from evaluation.comparison.scoring import Key
 from evaluation.errors import EvaluationError
-from evaluation.predictor import Model, Predictor
-from evaluation.reference import Reference
-from evaluation.scoring import Key
 
 
 @dataclass(frozen=True)

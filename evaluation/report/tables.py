@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from evaluation.comparison.result import Evaluation
 from evaluation.figures.style import CM, MS
-from evaluation.measures import masked_mean
-from evaluation.result import Evaluation
+from evaluation.measures.distance import masked_mean
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.paraview import write_paraview
-from evaluation.predictor import Model, Predictor
-from evaluation.reference import Reference
-from evaluation.result import Evaluation
-from evaluation.scoring import full_field, mesh_of
+from evaluation.comparison.predictor import Model, Predictor
+from evaluation.comparison.reference import Reference
+from evaluation.comparison.result import Evaluation
+from evaluation.comparison.scoring import full_field, mesh_of
 
 # Bytes of one predicted field held at once; several of them are.
 _BUDGET = 64 << 20

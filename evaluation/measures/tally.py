@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.measures import (
+from evaluation.measures.distance import (
     Peak,
     group_means,
     largest_node_error,
@@ -34,7 +34,7 @@ def state_blocks(states: int, nodes: int) -> Iterator[slice]:
 
 @dataclass
 class Tally:
-    """Feed blocks of states with `add`; every number is that of the whole run (see evaluation.scoring.RunScore).
+    """Feed blocks of states with `add`; every number is that of the whole run (see evaluation.comparison.scoring.RunScore).
 
     groups  grouping -> node numbers of each group
     """

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.errors import EvaluationError
-from evaluation.measures import masked_mean
-from evaluation.probes import GRADES, cfc_filter, possible_classes, probe_histories, rate
+from evaluation.measures.distance import masked_mean
+from evaluation.measures.probes import GRADES, cfc_filter, possible_classes, probe_histories, rate
 
 HIGHEST_CLASS = 180  # structural velocities and displacements; crush and occupant channels go higher than states do
 _ENDS = 2

@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from evaluation.drawing.pictures import DISPLACEMENT, ERROR
+from evaluation.drawing.rendering import choose_view, off_screen
 from evaluation.errors import EvaluationError
-from evaluation.pictures import DISPLACEMENT, ERROR
-from evaluation.rendering import choose_view, off_screen
 
 MAX_NODES = 10_000
 MAX_STATES = 31
@@ -221,7 +221,7 @@ def _exported(x: NDArray[np.float64], triangles: NDArray[Any]) -> bytes:
 
 
 def _page(scene: bytes, run: Mapping[str, Any], title: str) -> str:
-    """The viewer's page around `scene`, with the controls of `templates/viewer.html`."""
+    """The viewer's page around `scene`, with the controls of `viewer.html`."""
     from html import escape
     from importlib.resources import files
 
@@ -231,7 +231,7 @@ def _page(scene: bytes, run: Mapping[str, Any], title: str) -> str:
     out = io.StringIO()
     write_html(scene, out)
     page = out.getvalue()
-    template = files("evaluation").joinpath("templates/viewer.html").read_text(encoding="utf-8")
+    template = files("evaluation.drawing").joinpath("viewer.html").read_text(encoding="utf-8")
     controls = Template(template).render(run=json.dumps(run, separators=(",", ":")).replace("<", "\\u003c"))
     head, body, rest = page.partition("<body>")
     start, _, end = head.partition("<title>")

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evaluation.errors import EvaluationError
-from evaluation.measures import masked_mean
+from evaluation.measures.distance import masked_mean
 
 Floats = NDArray[np.float64]
 

@@ -1,7 +1,7 @@
 """Pictures of the mesh with text: truth, prediction and error; contributions of levels; kept nodes.
 
 Arrays in metres and seconds in, a matplotlib Figure out; lengths are shown in centimetres. The images themselves
-come from `evaluation.rendering`, so nothing here needs a display.
+come from `evaluation.drawing.rendering`, so nothing here needs a display.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from evaluation.drawing.rendering import Image, choose_view, render
 from evaluation.errors import EvaluationError
 from evaluation.figures.style import CM, INK, MS, Sheet, look
-from evaluation.rendering import Image, choose_view, render
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,21 +11,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.comparison import Entry, Split, entries
+from evaluation.comparison.predictor import Model, Predictor
+from evaluation.comparison.reference import Reference
+from evaluation.comparison.scoring import Key, RunScores, Scores, full_field, gather, mesh_of, score_run
+from evaluation.comparison.sensors import Sensors, choose_sensors
+from evaluation.comparison.split import Entry, Split, entries
+from evaluation.comparison.streaming import over_runs
+from evaluation.comparison.timing import Timing, time_predictions
 from evaluation.errors import EvaluationError
-from evaluation.measures import masked_mean
-from evaluation.pod import Pod, StreamedPod
-from evaluation.predictor import Model, Predictor
-from evaluation.reference import Reference
-from evaluation.regions import by_grid, by_part
-from evaluation.scoring import Key, RunScores, Scores, full_field, gather, mesh_of, score_run
-from evaluation.sensors import Sensors, choose_sensors
-from evaluation.streaming import over_runs
-from evaluation.tally import Groups
-from evaluation.timing import Timing, time_predictions
+from evaluation.measures.distance import masked_mean
+from evaluation.measures.pod import Pod, StreamedPod
+from evaluation.measures.regions import by_grid, by_part
+from evaluation.measures.tally import Groups
 
 if TYPE_CHECKING:
-    from evaluation.curves import Ratings
+    from evaluation.measures.curves import Ratings
 
 N_MODES = 50  # as many singular values as the paper shows
 
@@ -41,7 +41,7 @@ class Evaluation:
     context   name -> text for the methods section: data, split, versions, machine
     group_names  grouping -> name of each group
     sensors   where histories were taken; None without
-    files     ParaView files written of it (evaluation.files.write_run)
+    files     ParaView files written of it (evaluation.report.files.write_run)
     """
 
     reference: Reference
@@ -103,7 +103,7 @@ class Evaluation:
     @functools.cached_property
     def ratings(self) -> Ratings | None:
         """ISO/TS 18571 ratings at the probes; None where there are no sensors or the runs are too short."""
-        from evaluation.curves import rate_curves
+        from evaluation.measures.curves import rate_curves
 
         if self.sensors is None:
             return None

@@ -6,10 +6,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from evaluation.measures import lift
-from evaluation.predictor import Predictor
-from evaluation.reference import Reference
-from evaluation.scoring import mesh_of
+from evaluation.comparison.predictor import Predictor
+from evaluation.comparison.reference import Reference
+from evaluation.comparison.scoring import mesh_of
+from evaluation.measures.distance import lift
 
 
 @dataclass(frozen=True)

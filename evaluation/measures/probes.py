@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evaluation.errors import EvaluationError
-from evaluation.rigid import fit_rigid
+from evaluation.measures.rigid import fit_rigid
 
 Floats = NDArray[np.float64]
 
@@ -154,7 +154,7 @@ def intrusion(
     nodes         numbers of the nodes that intrude
     direction     (3,) of any length but zero, in the undeformed structure: (-1, 0, 0) is rearwards where x is forwards
     reference     numbers of at least three nodes off one line, such as the seat's cross member: the observer moves and
-                  turns with them (best fit, evaluation.rigid). Without: measured from the ground.
+                  turns with them (best fit, evaluation.measures.rigid). Without: measured from the ground.
 
     Raises EvaluationError for nodes that do not exist, a direction of zero, or where all nodes are gone throughout.
     """

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.comparison import Entry
+from evaluation.comparison.result import Evaluation
+from evaluation.comparison.split import Entry
 from evaluation.figures.style import CM, called
-from evaluation.measures import masked_mean
-from evaluation.result import Evaluation
+from evaluation.measures.distance import masked_mean
 
 FEW_RUNS = 10  # fewer test runs than this carry no reliable ranking of close models
 NEAR = 1.25  # "nearly as exact": at most a quarter worse than the best

@@ -9,10 +9,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from evaluation.comparison.reference import Reference
 from evaluation.errors import EvaluationError
-from evaluation.probes import intrusion
-from evaluation.reference import Reference
-from evaluation.rigid import split_error
+from evaluation.measures.probes import intrusion
+from evaluation.measures.rigid import split_error
 
 AXES = {"x": 0, "y": 1, "z": 2}
 N_PROBES = 4
@@ -46,7 +46,7 @@ class Watched:
 
 @dataclass(frozen=True)
 class Parted:
-    """Errors (state,), m, of rigid motion and of deformation, and the true sizes of both (see evaluation.rigid)."""
+    """Errors (state,), m, of rigid motion and of deformation, and the true sizes of both (see evaluation.measures.rigid)."""
 
     rigid: NDArray[np.float64]
     deformation: NDArray[np.float64]

@@ -1,0 +1,1 @@
+"""Models against the truth: the split they agree on, predictors, scores of runs, the result."""

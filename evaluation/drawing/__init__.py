@@ -1,0 +1,1 @@
+"""Pictures: rendering through VTK, sheets of pictures, the interactive viewer, mesh levels."""

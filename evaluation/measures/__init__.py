@@ -1,0 +1,1 @@
+"""What is measured: distances, tallies over runs, rigid motion, curves at probes, regions."""

@@ -1,0 +1,1 @@
+"""The report: page, tables, verdict, data card, ParaView files."""
