@@ -4,7 +4,7 @@
                                 [--case SET/MODE/NUMBER]
 
 Every folder of d3plot or OpenRadioss files under FOLDER (without: the small ones of the tests) is damaged `--each`
-times in each way, one file and one place at a time, and given to `crashkit.ingest.ingest` with all its fields; what
+times in each way, one file and one place at a time, and given to `crashkit.ingestion.ingest.ingest` with all its fields; what
 comes out is opened and validated. Sets that are incomplete as they are, are read with `allow_incomplete`, else nothing
 would be tried on them. `--quick` takes a few places. `--json` writes the share of the cases that must not be. The counts:
 
@@ -124,7 +124,7 @@ def outcome(folder: Path, output: Path, how: dict[str, Any], undamaged: dict[str
     """What ingest makes of `folder` with the options `how`, compared with the undamaged set."""
     from crashkit.dataset import open_dataset
     from crashkit.errors import CrashkitError
-    from crashkit.ingest import ingest
+    from crashkit.ingestion.ingest import ingest
     from data_schema import validate
 
     try:

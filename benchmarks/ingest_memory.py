@@ -135,7 +135,7 @@ def raw(folder: Path, runs: int, args: argparse.Namespace) -> dict[str, Any]:
     """One run, written again and again into a store of the same kind."""
     import zarr  # noqa: F401
 
-    from crashkit.store import ArraySpec, create_arrays, put_in_place
+    from crashkit.ingestion.store import ArraySpec, create_arrays, put_in_place
 
     values = tiled_states(COPIES * len(kart()[0]))
     spec = ArraySpec("displacement", ("time", "node", "xyz"), values.shape, "float32")

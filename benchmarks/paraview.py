@@ -25,7 +25,7 @@ from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline 
 from vtkmodules.vtkIOHDF import vtkHDFWriter
 from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
-from crashkit.paraview import write_paraview
+from crashkit.writers.paraview import write_paraview
 
 GOAL = 2.0
 

@@ -41,7 +41,7 @@ def demo_dataset(path: Path) -> Path:
     """The embedded runs with their hierarchy, made once."""
     from crashkit.cli.coarsen import coarsen
     from crashkit.dataset import demo_data
-    from crashkit.ingest import ingest
+    from crashkit.ingestion.ingest import ingest
 
     if not path.exists():
         part = path.with_name(f"part-{path.name}")

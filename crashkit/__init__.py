@@ -7,15 +7,13 @@ The functions below are what the commands of the same name call; they are import
 from __future__ import annotations
 
 import importlib
-import sys
-from types import ModuleType
 from typing import Any
 
 __version__ = "0.1.0"
 
 # Public name -> "module:attribute".
 _LAZY = {
-    "ingest": "crashkit.ingest:ingest",
+    "ingest": "crashkit.ingestion.ingest:ingest",
     "open_dataset": "crashkit.dataset:open_dataset",
     "open_hierarchy": "crashkit.dataset:open_hierarchy",
     "validate": "data_schema:validate",
@@ -24,7 +22,7 @@ _LAZY = {
     "load_model": "crashkit.cli.predict:load_model",
     "predict": "crashkit.cli.predict:predict",
     "evaluate": "crashkit.cli.evaluate:evaluate",
-    "write_paraview": "crashkit.paraview:write_paraview",
+    "write_paraview": "crashkit.writers.paraview:write_paraview",
     "CrashkitError": "crashkit.errors:CrashkitError",
 }
 
@@ -40,15 +38,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted(__all__)
-
-
-class _Package(ModuleType):
-    """The module `crashkit.ingest` and the function in it share a name; as attribute of the package it is the function."""
-
-    def __setattr__(self, name: str, value: object) -> None:
-        if name in _LAZY and isinstance(value, ModuleType):
-            return
-        super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package

@@ -23,12 +23,12 @@ from xarray.core import indexing
 from crashkit import __version__
 from crashkit.dataset import open_dataset
 from crashkit.errors import DataError, ReadError
+from crashkit.ingestion.run_view import RunView, gone_nodes
+from crashkit.ingestion.store import SUFFIXES
+from crashkit.ingestion.structure import structure_of
+from crashkit.ingestion.survey import reader_options, wanted_field
 from crashkit.readers import reader_for
 from crashkit.readers.base import Run, Runs
-from crashkit.run_view import RunView, gone_nodes
-from crashkit.store import SUFFIXES
-from crashkit.structure import structure_of
-from crashkit.survey import reader_options, wanted_field
 from data_schema import CONVENTIONS, to_si, unit_system
 
 

@@ -58,7 +58,7 @@ def command(
     from dataclasses import asdict
     from time import monotonic
 
-    from crashkit.ingest import ingest
+    from crashkit.ingestion.ingest import ingest
 
     if on_error not in ("stop", "skip"):
         raise typer.BadParameter(f"{on_error!r}; expected stop or skip", param_hint="--on-error")

@@ -212,7 +212,7 @@ def write_prediction(
 
     from crashkit.errors import DataError, OutputError
     from crashkit.mesh.probe import without_sides
-    from crashkit.paraview import write_paraview
+    from crashkit.writers.paraview import write_paraview
 
     further = further or {}
     level = int(run.attrs["level"])

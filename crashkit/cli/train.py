@@ -54,7 +54,7 @@ def train(
     Raises SurrogateError for settings and data that do not fit, DataError and ReadError for the dataset, OutputError
     where `output` cannot be written, Diverged where a loss is not finite: then the last good weights are stored.
     """
-    from crashkit.cli._campaign import open_campaign
+    from crashkit.api.campaign import open_campaign
     from surrogates.checkpoints import Checkpoints
     from surrogates.config import settings
     from surrogates.errors import Diverged, SurrogateError

@@ -11,7 +11,7 @@ from scipy import sparse
 
 from crashkit.mesh.levels import Hierarchy
 from crashkit.mesh.probe import without_sides
-from crashkit.paraview import write_paraview
+from crashkit.writers.paraview import write_paraview
 
 
 def write_levels(

@@ -2,7 +2,7 @@
 
 A reader is one file in this folder with a class that has `name`, `sniff`, `runs` and ends with
 `register(...)`. Readers write nothing and convert nothing: units, alignment, part selection and the dataset's
-layout belong to `crashkit.ingest`, so that they are the same for every format.
+layout belong to `crashkit.ingestion`, so that they are the same for every format.
 """
 
 from __future__ import annotations

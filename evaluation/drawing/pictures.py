@@ -150,7 +150,7 @@ def file_picture(
 
     truth, prediction  names of the point arrays (n, 3), m, in the file; its points are undeformed
     """
-    from crashkit.paraview import read_state
+    from crashkit.writers.paraview import read_state
 
     _, mesh = read_state(path, state)
     missing = [array for array in (truth, prediction) if array not in mesh.point_data]

@@ -25,7 +25,7 @@ class FromFile:
     model: str
 
     def numbers(self) -> Columns:
-        from crashkit.paraview import read_state
+        from crashkit.writers.paraview import read_state
 
         time, mesh = read_state(self.path)
         arrays = {name: np.asarray(mesh.point_data[name]) for name in mesh.point_data}

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crashkit.paraview import write_paraview
+from crashkit.writers.paraview import write_paraview
 from evaluation.comparison.predictor import Model, Predictor
 from evaluation.comparison.reference import Reference
 from evaluation.comparison.result import Evaluation

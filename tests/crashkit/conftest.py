@@ -25,7 +25,7 @@ def memory() -> Iterator[RunsInMemory]:
 def demo_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The embedded kart runs as a dataset; not to be changed."""
     from crashkit.dataset import demo_data
-    from crashkit.ingest import ingest
+    from crashkit.ingestion.ingest import ingest
 
     output = tmp_path_factory.mktemp("demo") / "kart.zarr"
     ingest(demo_data(), output)
@@ -35,4 +35,4 @@ def demo_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def quick_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     """Files need not survive a power cut during a test."""
-    monkeypatch.setattr("crashkit.store._synchronise", lambda path: None)
+    monkeypatch.setattr("crashkit.ingestion.store._synchronise", lambda path: None)

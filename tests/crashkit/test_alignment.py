@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
-from crashkit.alignment import common_time, flags_at, interpolate, interpolation_error, same_time
 from crashkit.errors import DataError
+from crashkit.ingestion.alignment import common_time, flags_at, interpolate, interpolation_error, same_time
 
 
 def uneven(count: int, seed: int) -> np.ndarray:

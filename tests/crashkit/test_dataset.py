@@ -19,7 +19,7 @@ from memory_runs import MemoryRun, RunsInMemory
 import crashkit
 from crashkit.dataset import dataset_checksum, demo_data, open_dataset, reading, runs_of
 from crashkit.errors import DataError, ReadError
-from crashkit.ingest import ingest
+from crashkit.ingestion.ingest import ingest
 
 NAMES = [f"run_{k:03d}" for k in range(10)]
 

@@ -14,7 +14,7 @@ from memory_runs import MemoryRun, RunsInMemory
 
 from crashkit.dataset import demo_data, open_dataset
 from crashkit.errors import CrashkitError, DataError
-from crashkit.ingest import ingest
+from crashkit.ingestion.ingest import ingest
 from crashkit.readers.base import FieldInfo
 from data_schema import validate
 

@@ -19,11 +19,11 @@ import pytest
 import xarray as xr
 from memory_runs import MemoryRun, RunsInMemory
 
-from crashkit import assembly, store, transfer
 from crashkit.dataset import demo_data, open_dataset
 from crashkit.errors import DataError, OutputError, ReadError
-from crashkit.ingest import ingest
-from crashkit.staging import Staging
+from crashkit.ingestion import assembly, store, transfer
+from crashkit.ingestion.ingest import ingest
+from crashkit.ingestion.staging import Staging
 from data_schema import validate
 
 OUTPUTS = (".zarr", ".nc")
@@ -48,7 +48,7 @@ def campaign(path: Path, runs: slice, factor: float = 1.0) -> Path:
 
 
 def start(output: Path, *sources: Path) -> subprocess.Popen[str]:
-    code = "import sys; from crashkit.ingest import ingest; ingest(sys.argv[2:], sys.argv[1], names='{source}-{run}')"
+    code = "import sys; from crashkit.ingestion.ingest import ingest; ingest(sys.argv[2:], sys.argv[1], names='{source}-{run}')"
     return subprocess.Popen([sys.executable, "-c", code, str(output), *map(str, sources)])
 
 

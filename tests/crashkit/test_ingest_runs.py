@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from memory_runs import MemoryRun, RunsInMemory, plate, shuffled
 from test_structure import block
 
-from crashkit import transfer
 from crashkit.dataset import open_dataset
 from crashkit.errors import CrashkitError, DataError, OutputError, ReadError
-from crashkit.ingest import IngestSummary, ingest
+from crashkit.ingestion import transfer
+from crashkit.ingestion.ingest import IngestSummary, ingest
 from crashkit.readers.base import FieldInfo
 from data_schema import validate
 

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from crashkit.errors import DataError, ReadError
-from crashkit.parameter_table import read_parameter_table
+from crashkit.ingestion.parameter_table import read_parameter_table
 
 ROWS = [
     {"run": "001", "impact speed [km/h]": 36.0, "angle": 15},

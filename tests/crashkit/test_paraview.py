@@ -22,7 +22,7 @@ from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
 from vtkmodules.vtkIOHDF import vtkHDFReader
 
 from crashkit.errors import DataError, OutputError, ReadError
-from crashkit.paraview import State, read_state, write_paraview, write_states
+from crashkit.writers.paraview import State, read_state, write_paraview, write_states
 
 # A square and a triangle on one edge, and two lone edges: everything a mesh of ours can hold.
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0.5, 0], [3, 0.5, 1]], float)
@@ -265,7 +265,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, suffix):
     script = (
         "import numpy as np, sys\n"
         "from crashkit.errors import OutputError\n"
-        "from crashkit.paraview import write_paraview\n"
+        "from crashkit.writers.paraview import write_paraview\n"
         "points = np.random.default_rng(0).normal(size=(20000, 3))\n"
         "try:\n"
         "    write_paraview(sys.argv[1], points, np.array([[0, 1, 2]]), [0.0, 1.0])\n"

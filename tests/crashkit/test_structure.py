@@ -9,8 +9,8 @@ import pytest
 from memory_runs import plate, shuffled
 
 from crashkit.errors import DataError
+from crashkit.ingestion.structure import matched, structure_of
 from crashkit.readers.base import Part, RunMesh
-from crashkit.structure import matched, structure_of
 
 
 def block(nx: int = 2) -> RunMesh:

@@ -24,7 +24,7 @@ def campaign(tmp_path_factory) -> Path:
     """A folder with a dataset of eight real runs and two trained models that hold the last three runs out."""
     from crashkit.cli.coarsen import coarsen
     from crashkit.cli.train import train
-    from crashkit.ingest import ingest
+    from crashkit.ingestion.ingest import ingest
 
     folder = tmp_path_factory.mktemp("campaign")
     with h5py.File(demo_data()) as source, h5py.File(folder / "kart.h5", "w") as file:
@@ -142,7 +142,7 @@ def test_a_test_run_that_was_trained_on_is_refused(campaign, tmp_path):
 
 
 def test_a_model_of_another_dataset_is_refused(campaign, tmp_path):
-    from crashkit.ingest import ingest
+    from crashkit.ingestion.ingest import ingest
 
     with h5py.File(campaign / "kart.h5") as source, h5py.File(tmp_path / "other.h5", "w") as file:
         for name in ("kart/displacements", "kart/reference_configuration", "kart/faces", "parameter", "time"):
@@ -173,14 +173,14 @@ def test_a_hierarchy_made_anew_is_noticed(campaign, tmp_path):
 
 
 def test_a_dataset_without_hierarchy_is_an_error_for_a_cascade(campaign, tmp_path):
-    from crashkit.ingest import ingest
+    from crashkit.ingestion.ingest import ingest
 
     ingest([campaign / "kart.h5"], tmp_path / "kart.zarr")
     _fails(run(tmp_path / "kart.zarr", campaign / "mh0", "-o", tmp_path / "report"), "hierarchy", "coarsen")
 
 
 def test_a_full_mesh_model_needs_no_hierarchy(campaign, small, tmp_path):
-    from crashkit.ingest import ingest
+    from crashkit.ingestion.ingest import ingest
 
     ingest([campaign / "kart.h5"], tmp_path / "kart.zarr")
     result = run(tmp_path / "kart.zarr", campaign / "podnn", "-o", tmp_path / "report", "--json")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from crashkit.paraview import write_paraview
+from crashkit.writers.paraview import write_paraview
 from evaluation.drawing.pictures import (
     KeptNodes,
     Row,

@@ -19,7 +19,7 @@ from crashkit.cli.predict import predict
 from crashkit.errors import DataError
 from crashkit.mesh.levels import Hierarchy, Level
 from crashkit.mesh.store import write_hierarchy
-from crashkit.paraview import read_state
+from crashkit.writers.paraview import read_state
 from surrogates.config import settings
 from surrogates.model import Surrogate
 from surrogates.storage import load

@@ -297,7 +297,7 @@ def test_what_is_no_dataset_is_one_line(dataset: Path, command: str, kind: str) 
 def test_interrupt_says_how_to_go_on(tmp_path: Path) -> None:
     """Ctrl-C from the first run on: what is finished is kept and the message says so."""
     code = (
-        "import os, signal, crashkit.staging as s, crashkit.cli as c\n"
+        "import os, signal, crashkit.ingestion.staging as s, crashkit.cli as c\n"
         "real = s.Staging.finish\n"
         "def finish(self, run):\n"
         "    real(self, run)\n"

@@ -47,4 +47,4 @@ def test_failure_is_one_line_and_code_one(tmp_path) -> None:
 
 
 def test_public_functions_stay_functions_after_their_modules_are_imported() -> None:
-    assert _python("import crashkit, crashkit.ingest; print(callable(crashkit.ingest))") == "True"
+    assert _python("import crashkit, crashkit.ingestion; print(callable(crashkit.ingest))") == "True"

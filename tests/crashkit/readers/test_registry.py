@@ -11,9 +11,9 @@ import pytest
 
 from crashkit import readers
 from crashkit.errors import CrashkitError, ReadError
-from crashkit.paraview import write_paraview
 from crashkit.readers import reader_for
 from crashkit.readers.base import Runs
+from crashkit.writers.paraview import write_paraview
 
 OURS = {"d3plot", "exodus", "kart-hdf5", "meshio", "openradioss", "physicsnemo", "vtk-series", "vtkhdf"}
 

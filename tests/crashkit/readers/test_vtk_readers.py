@@ -19,10 +19,10 @@ from vtkmodules.vtkIOHDF import vtkHDFWriter
 from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
 from crashkit.errors import ReadError
-from crashkit.paraview import write_paraview
 from crashkit.readers import reader_for
 from crashkit.readers._vtk_legacy import read_legacy
 from crashkit.readers._vtk_process import read_xml
+from crashkit.writers.paraview import write_paraview
 
 
 class _Transient(VTKPythonAlgorithmBase):

@@ -1,9 +1,9 @@
 """Runs of a solver become one dataset: checked, in SI units, at common times, written run by run.
 
-Two passes. The survey (`crashkit.survey`) opens every run, reads no displacement, and settles what all runs share.
-Then each run is transferred on its own (`crashkit.transfer`), here or by Dask workers, into a staging folder beside
-the output (`crashkit.staging`), where a journal notes the finished ones. At the end the dataset is put together from
-them and takes its place in one step (`crashkit.store`). A killed ingest goes on behind the last note, and ends with
+Two passes. The survey (`crashkit.ingestion.survey`) opens every run, reads no displacement, and settles what all runs share.
+Then each run is transferred on its own (`crashkit.ingestion.transfer`), here or by Dask workers, into a staging folder beside
+the output (`crashkit.ingestion.staging`), where a journal notes the finished ones. At the end the dataset is put together from
+them and takes its place in one step (`crashkit.ingestion.store`). A killed ingest goes on behind the last note, and ends with
 the same bytes; a dataset that is appended to stays whole until the new one replaces it.
 """
 
@@ -20,14 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit import __version__
-from crashkit.alignment import common_time, reach, same_time
-from crashkit.assembly import Existing, publish
 from crashkit.errors import CrashkitError, DataError, OutputError, ReadError
-from crashkit.staging import BackgroundHashes, StagedRun, Staging, key_of
-from crashkit.store import check_output, recover
-from crashkit.structure import Structure
-from crashkit.survey import Choice, Found, Survey, described, reader_options, survey
-from crashkit.transfer import Layout, is_whole, let_memory_go, transfer
+from crashkit.ingestion.alignment import common_time, reach, same_time
+from crashkit.ingestion.assembly import Existing, publish
+from crashkit.ingestion.staging import BackgroundHashes, StagedRun, Staging, key_of
+from crashkit.ingestion.store import check_output, recover
+from crashkit.ingestion.structure import Structure
+from crashkit.ingestion.survey import Choice, Found, Survey, described, reader_options, survey
+from crashkit.ingestion.transfer import Layout, is_whole, let_memory_go, transfer
 
 Progress = Callable[[int, int, str], None]
 
@@ -81,7 +81,7 @@ def ingest(
 ) -> IngestSummary:
     """Read all runs in `sources` (files or folders) and write them as one dataset to `output` (`.zarr` or `.nc`).
 
-    params            table of design parameters (`crashkit.parameter_table`), before those of the source
+    params            table of design parameters (`crashkit.ingestion.parameter_table`), before those of the source
     units             unit system of the source, e.g. "mm-ms-kg"; needed where the source states none
     reader, mesh      source format by name; file with the faces where the source has none
     time_step         time between two states, in the source's unit, where the source holds no times

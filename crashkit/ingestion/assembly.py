@@ -11,15 +11,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crashkit import __version__, store
-from crashkit.alignment import same_time
+from crashkit import __version__
 from crashkit.errors import OutputError, ReadError
+from crashkit.ingestion import store
+from crashkit.ingestion.alignment import same_time
+from crashkit.ingestion.staging import BackgroundHashes, StagedRun, Staging
+from crashkit.ingestion.store import ArraySpec, RunSource
+from crashkit.ingestion.structure import Structure
+from crashkit.ingestion.survey import Found
+from crashkit.ingestion.transfer import Layout
 from crashkit.readers.base import Part
-from crashkit.staging import BackgroundHashes, StagedRun, Staging
-from crashkit.store import ArraySpec, RunSource
-from crashkit.structure import Structure
-from crashkit.survey import Found
-from crashkit.transfer import Layout
 from data_schema import CONVENTIONS, dataset_checksum, digests_of_run, parameters, run_checksum, validate
 from data_schema import fields as fields_of
 

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
+from crashkit.ingestion.structure import Structure
+from crashkit.ingestion.survey import Field, cell_fields
 from crashkit.readers._checks import reading
 from crashkit.readers.base import Run
-from crashkit.structure import Structure
-from crashkit.survey import Field, cell_fields
 from data_schema.units import UnitSystem, UnknownUnits
 
 Flags = NDArray[np.bool_]

@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crashkit.alignment import flags_at, interpolate, interpolation_error, same_time
 from crashkit.errors import DataError
+from crashkit.ingestion.alignment import flags_at, interpolate, interpolation_error, same_time
+from crashkit.ingestion.run_view import Flags, RunView, gone_nodes
+from crashkit.ingestion.staging import StagedRun
+from crashkit.ingestion.store import ArraySpec, create_arrays
+from crashkit.ingestion.structure import Structure, matched
+from crashkit.ingestion.survey import Choice, Field, Found, reopen
 from crashkit.readers.base import Run, split_states
-from crashkit.run_view import Flags, RunView, gone_nodes
-from crashkit.staging import StagedRun
-from crashkit.store import ArraySpec, create_arrays
-from crashkit.structure import Structure, matched
-from crashkit.survey import Choice, Field, Found, reopen
 from data_schema import unit_system
 from data_schema.checksum import BlockDigest, array_digest, block_digest
 from data_schema.validation import FIRST_STATE_TOLERANCE

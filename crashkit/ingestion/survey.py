@@ -2,7 +2,7 @@
 
 A run is refused here, by name and with the place in its file, if it is incomplete, has times that do not increase,
 no known units, another mesh than the runs before it, or lacks a parameter. What the values hold is checked when they
-are read (`crashkit.transfer`).
+are read (`crashkit.ingestion.transfer`).
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.errors import CrashkitError, DataError, ReadError
-from crashkit.parameter_table import read_parameter_table
+from crashkit.ingestion.parameter_table import read_parameter_table
+from crashkit.ingestion.structure import Structure, matched, structure_of
 from crashkit.readers import reader_for
 from crashkit.readers._checks import reading
 from crashkit.readers.base import FieldInfo, Run, Runs
-from crashkit.structure import Structure, matched, structure_of
 from data_schema import DIMENSIONS, VARIABLES, to_si, unit_system
 from data_schema.units import UnknownUnits, si_unit
 

@@ -1,0 +1,1 @@
+"""The public functions: paths or objects in, objects out; no typer, no printing."""

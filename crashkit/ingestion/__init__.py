@@ -1,0 +1,1 @@
+"""From solver files to the dataset: survey, structure, alignment, transfer, staging, assembly."""
