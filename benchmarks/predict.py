@@ -39,15 +39,15 @@ from torch_geometric.nn import ChebConv as PeerConv
 from train_step import median_turns
 
 from crashkit.mesh.hierarchy import build_hierarchy
-from surrogates.cascade import Cascade, build_level
-from surrogates.config import Settings, settings
-from surrogates.data import Campaign, GraphLevel
-from surrogates.graphs import Graphs
-from surrogates.inputs import InputScaling, Ranges
-from surrogates.level import Level
-from surrogates.model import Record, Surrogate
-from surrogates.process import LatentProcess
-from surrogates.samples import Split
+from surrogates.data.campaign import Campaign, GraphLevel
+from surrogates.data.graphs import Graphs
+from surrogates.data.inputs import InputScaling, Ranges
+from surrogates.data.samples import Split
+from surrogates.models.cascade import Cascade, build_level
+from surrogates.models.level import Level
+from surrogates.regression.latent_process import LatentProcess
+from surrogates.settings import Settings, settings
+from surrogates.surrogate import Record, Surrogate
 
 STATES, RUNS, GOAL = 101, 84, 3.0
 PARAMETERS = np.array([[10.0, -10.0, 2e8], [30.0, 10.0, 5e8]])

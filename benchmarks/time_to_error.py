@@ -28,10 +28,10 @@ from typing import Any
 import torch
 
 from crashkit.cli.train import train
-from surrogates.config import settings
-from surrogates.loop import Epoch
-from surrogates.model import Surrogate
-from surrogates.storage import load
+from surrogates.settings import settings
+from surrogates.storage.folder import load
+from surrogates.surrogate import Surrogate
+from surrogates.training.loop import Epoch
 
 GOAL = 10.0
 DEMO_NODES, DEMO_TEST = [300, 75, 19], "27:36"

@@ -4,7 +4,7 @@
                                     [--quick] [--json FILE]
 
 The step: batch 32, approximation and reconstruction loss, AdamW; encoder 3-6-12-24 channels and a dense layer to
-latent 4, decoder in reverse, MLP 4-64-64-64-4, ELU, three Chebyshev terms. Ours is `surrogates.operators`. The peer is
+latent 4, decoder in reverse, MLP 4-64-64-64-4, ELU, three Chebyshev terms. Ours is `surrogates.operators.graph`. The peer is
 the same network of torch_geometric's ChebConv over a block-diagonal batch, as public code does it: samples below each
 other, edges repeated for every sample, the Laplacian normalised in every forward pass of every layer. Both start from
 the same weights, and their losses are compared before anything is timed. The peer is spared the making of its
@@ -38,7 +38,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch_geometric.nn import ChebConv as PeerConv
 
-from surrogates.operators import GraphDecoder, GraphEncoder, GraphOperator
+from surrogates.operators.graph import GraphDecoder, GraphEncoder, GraphOperator
 
 BATCH, LATENT, CHANNELS, ORDER = 32, 4, (3, 6, 12, 24), 3
 GOAL = 10.0

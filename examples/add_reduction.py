@@ -1,7 +1,7 @@
 """Adding a reduction: a quadratic manifold, x = D z + Q (z * z) + b with z = E x, in under 60 lines.
 
 Run it with `python examples/add_reduction.py DATASET MODEL TEST_RUNS`: it trains a cascade of such levels, stores it and
-asks it for a run. Where the reduction is registered, `surrogates.storage.load` reads the model again.
+asks it for a run. Where the reduction is registered, `surrogates.storage.folder.load` reads the model again.
 Source: Geelen, Wright, Willcox 2023, doi 10.1016/j.cma.2022.115717 (there the maps are computed, here they are trained).
 """
 
@@ -11,8 +11,8 @@ from pathlib import Path
 from torch import Tensor, nn
 
 from crashkit.cli.train import train
-from surrogates.config import LevelSettings
-from surrogates.reduction import Reduction, flat, register, unflat
+from surrogates.reductions.reduction import Reduction, flat, register, unflat
+from surrogates.settings import LevelSettings
 
 
 class QuadraticReduction(Reduction):

@@ -3,7 +3,7 @@
  * A state's block is laid out as [node][channel][lane], lane = 0 .. 15 (the states of the block); all arrays are
  * contiguous. The powers L^k x of a block, k > 0, stand behind each other: [power - 1][node][channel][lane]. Weights
  * are those of the powers of L, ordered as each function says. `docs/speed.md` has the measurements;
- * `surrogates/operators.py` has the same operations in torch, which are used where this file could not be compiled and
+ * `surrogates/operators/graph.py` has the same operations in torch, which are used where this file could not be compiled and
  * against which it is tested.
  *
  * Compiled for float and double by including itself.

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from surrogates.loop import Fit
-    from surrogates.model import Surrogate
+    from surrogates.surrogate import Surrogate
+    from surrogates.training.loop import Fit
 
 
 class SurrogateError(Exception):

@@ -19,11 +19,11 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from surrogates.errors import SurrogateError
-from surrogates.network import Network
-from surrogates.operators import exportable
+from surrogates.models.base import Network
+from surrogates.operators.graph import exportable
 
 if TYPE_CHECKING:
-    from surrogates.model import Surrogate
+    from surrogates.surrogate import Surrogate
 
 # Fewer validation runs than this leave no other run to estimate the scale on.
 FEWEST_RUNS = 2

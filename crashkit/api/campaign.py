@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from surrogates.data import Campaign, GraphLevel
+    from surrogates.data.campaign import Campaign, GraphLevel
 
 
 class RunField:
@@ -45,7 +45,7 @@ def open_campaign(path: str | Path, test: Any = None) -> Campaign:
     from crashkit.errors import DataError
     from crashkit.mesh.store import level_displacement
     from data_schema import fields, parameters
-    from surrogates.data import Campaign
+    from surrogates.data.campaign import Campaign
 
     path = Path(path)
     with open_dataset(path) as opened:
@@ -87,7 +87,7 @@ def _levels(path: Path) -> tuple[GraphLevel, ...]:
     """The hierarchy as the surrogates take it; empty where the dataset has none."""
     from crashkit.errors import DataError
     from crashkit.mesh.store import read_hierarchy
-    from surrogates.data import GraphLevel
+    from surrogates.data.campaign import GraphLevel
 
     try:
         stored = read_hierarchy(path).levels

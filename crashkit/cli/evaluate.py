@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from evaluation.comparison.result import Evaluation
     from evaluation.comparison.scoring import RunScores
     from evaluation.comparison.sensors import Sensors
-    from surrogates.model import Surrogate
+    from surrogates.surrogate import Surrogate
 
 Progress = Callable[[str, int, int], None]  # what is being done, steps done, steps in all
 

@@ -18,8 +18,8 @@ def command(
     json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Write one level as ONNX or torch.export file, and check that it predicts the same."""
-    from surrogates.export import export
-    from surrogates.storage import load
+    from surrogates.storage.export import export
+    from surrogates.storage.folder import load
 
     error = export(load(model), output, level, full=full)
     if json:

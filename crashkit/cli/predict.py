@@ -17,15 +17,15 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import ArrayLike, NDArray
 
-    from surrogates.inputs import Ranges
-    from surrogates.model import Surrogate
+    from surrogates.data.inputs import Ranges
+    from surrogates.surrogate import Surrogate
 
 SUFFIXES = (".pvd", ".vtkhdf", ".vtu", ".vtp", ".npz")
 
 
 def load_model(folder: str | Path) -> Surrogate:
     """The model stored in `folder`; raises ModelFolderError if it is none, was altered or does not fit."""
-    from surrogates.storage import load
+    from surrogates.storage.folder import load
 
     return load(Path(folder))
 

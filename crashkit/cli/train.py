@@ -12,10 +12,10 @@ import typer
 from crashkit.cli._console import print_json, progress, say, table
 
 if TYPE_CHECKING:
-    from surrogates.config import Settings
-    from surrogates.data import Campaign
-    from surrogates.loop import Epoch
-    from surrogates.model import Surrogate
+    from surrogates.data.campaign import Campaign
+    from surrogates.settings import Settings
+    from surrogates.surrogate import Surrogate
+    from surrogates.training.loop import Epoch
 
 
 def train(
@@ -37,7 +37,7 @@ def train(
     """Train a surrogate on the dataset at `dataset` and store it as the folder `output`.
 
     model      mh, podnn, aenn, gaenn, pod-gpr or pod-rbf; without, what `config` says, else mh
-    config     YAML file with the fields of `surrogates.config.Settings`
+    config     YAML file with the fields of `surrogates.settings.Settings`
     overrides  "path=value", such as "level.epochs=200"; they win over `config`
     preset     fast, or paper for exactly what the paper does
     test       runs that nobody may see: "27:36", names, a number or a fraction (drawn at random, seeded)
@@ -55,11 +55,11 @@ def train(
     where `output` cannot be written, Diverged where a loss is not finite: then the last good weights are stored.
     """
     from crashkit.api.campaign import open_campaign
-    from surrogates.checkpoints import Checkpoints
-    from surrogates.config import settings
     from surrogates.errors import Diverged, SurrogateError
-    from surrogates.storage import save
-    from surrogates.train import train as fit
+    from surrogates.settings import settings
+    from surrogates.storage.folder import save
+    from surrogates.training.checkpoints import Checkpoints
+    from surrogates.training.train import train as fit
 
     output = Path(output)
     chosen = settings(model, preset, config, overrides)

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from scipy import sparse
 
-from surrogates.data import Campaign, GraphLevel
+from surrogates.data.campaign import Campaign, GraphLevel
 
 SIDES = (9, 5, 3)
 TIME = np.linspace(0.0, 0.03, 7)

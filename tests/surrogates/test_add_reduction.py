@@ -11,11 +11,12 @@ import plate
 import pytest
 import torch
 
-from surrogates import config, reduction
-from surrogates.config import settings
+from surrogates import settings as config
 from surrogates.errors import SurrogateError
-from surrogates.storage import load, save
-from surrogates.train import train
+from surrogates.reductions import reduction
+from surrogates.settings import settings
+from surrogates.storage.folder import load, save
+from surrogates.training.train import train
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "add_reduction.py"
 SMALL = ("level.latent=3", "level.epochs=2", "levels=[2, 1]", "level.mlp.widths=[8]", "level.reduction=quadratic")

@@ -11,8 +11,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from surrogates import compiled
-from surrogates.operators import GraphDecoder, GraphEncoder, GraphOperator
+from surrogates.operators import compiled
+from surrogates.operators.graph import GraphDecoder, GraphEncoder, GraphOperator
 
 
 def graph(n_nodes: int, seed: int = 0) -> GraphOperator:

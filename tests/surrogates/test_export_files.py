@@ -10,11 +10,11 @@ import plate
 import pytest
 import torch
 
-from surrogates.config import settings
 from surrogates.errors import SurrogateError
-from surrogates.export import export
-from surrogates.model import Surrogate
-from surrogates.train import train
+from surrogates.settings import settings
+from surrogates.storage.export import export
+from surrogates.surrogate import Surrogate
+from surrogates.training.train import train
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def test_exporting_leaves_the_surrogate_as_it_was(surrogate: Surrogate, tmp_path
 def test_a_file_that_disagrees_is_not_kept(
     surrogate: Surrogate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("surrogates.export.TOLERANCE", -1.0)
+    monkeypatch.setattr("surrogates.storage.export.TOLERANCE", -1.0)
     with pytest.raises(SurrogateError, match=r"differs by .* not kept"):
         export(surrogate, tmp_path / "model.pt2")
     assert list(tmp_path.iterdir()) == []

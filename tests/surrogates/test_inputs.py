@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from surrogates.inputs import InputScaling, Ranges
+from surrogates.data.inputs import InputScaling, Ranges
 
 NAMES, UNITS = ("impact_speed", "impact_angle", "yield_stress"), ("m s-1", "degree", "Pa")
 

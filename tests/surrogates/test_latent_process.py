@@ -10,13 +10,13 @@ import pytest
 import torch
 from scipy.interpolate import CubicHermiteSpline
 
-from surrogates.cascade import Cascade
-from surrogates.config import settings
-from surrogates.model import Surrogate
-from surrogates.pod_regression import Gaussian
-from surrogates.process import LatentProcess, fit_process
-from surrogates.storage import load, save
-from surrogates.train import train
+from surrogates.models.cascade import Cascade
+from surrogates.models.pod_regression import Gaussian
+from surrogates.regression.latent_process import LatentProcess, fit_process
+from surrogates.settings import settings
+from surrogates.storage.folder import load, save
+from surrogates.surrogate import Surrogate
+from surrogates.training.train import train
 
 RUNS = np.random.default_rng(0).uniform(-1, 1, (12, 2))
 TIME = np.array([-1.0, -0.4, 0.1, 0.5, 1.0])

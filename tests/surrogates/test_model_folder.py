@@ -9,11 +9,11 @@ import numpy as np
 import plate
 import pytest
 
-from surrogates.config import settings
 from surrogates.errors import ModelFolderError
-from surrogates.model import Surrogate
-from surrogates.storage import load, save
-from surrogates.train import train
+from surrogates.settings import settings
+from surrogates.storage.folder import load, save
+from surrogates.surrogate import Surrogate
+from surrogates.training.train import train
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +124,7 @@ def test_a_save_that_fails_leaves_nothing_behind(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("surrogates.storage.save_file", full)
+    monkeypatch.setattr("surrogates.storage.folder.save_file", full)
     with pytest.raises(ModelFolderError, match="No space left on device"):
         save(surrogate, tmp_path / "model")
     assert list(tmp_path.iterdir()) == []

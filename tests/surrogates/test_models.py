@@ -10,14 +10,14 @@ import plate
 import pytest
 import torch
 
-from surrogates.cascade import Cascade
-from surrogates.checkpoints import Checkpoints
-from surrogates.config import settings
 from surrogates.errors import Diverged, SurrogateError
-from surrogates.loop import Epoch
-from surrogates.model import Surrogate
-from surrogates.storage import load, save
-from surrogates.train import train
+from surrogates.models.cascade import Cascade
+from surrogates.settings import settings
+from surrogates.storage.folder import load, save
+from surrogates.surrogate import Surrogate
+from surrogates.training.checkpoints import Checkpoints
+from surrogates.training.loop import Epoch
+from surrogates.training.train import train
 
 SHORT = ("level.epochs=4", "transfer.epochs=1", "level.batch=16")
 

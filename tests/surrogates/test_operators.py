@@ -12,7 +12,7 @@ from torch_geometric.nn import GCN2Conv as PeerGCN2
 from torch_geometric.nn import GCNConv as PeerGCN
 
 from surrogates.errors import SurrogateError
-from surrogates.operators import (
+from surrogates.operators.graph import (
     WIDE_UP_TO,
     ChebConv,
     GCN2Conv,

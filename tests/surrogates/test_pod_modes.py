@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from surrogates.pod import pod
+from surrogates.reductions.pod import pod
 
 
 def runs(count: int = 6, seed: int = 0) -> np.ndarray:

@@ -8,11 +8,11 @@ import pytest
 from scipy.interpolate import RBFInterpolator
 from sklearn.gaussian_process import GaussianProcessRegressor
 
-from surrogates.config import settings
-from surrogates.data import Campaign
+from surrogates.data.campaign import Campaign
 from surrogates.errors import SurrogateError
-from surrogates.pod_regression import Gaussian, PodRegression, RadialBasis, _kernel
-from surrogates.train import train
+from surrogates.models.pod_regression import Gaussian, PodRegression, RadialBasis, _kernel
+from surrogates.settings import settings
+from surrogates.training.train import train
 
 
 def e2(a: np.ndarray, b: np.ndarray) -> float:

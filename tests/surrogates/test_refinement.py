@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from surrogates.config import settings as choose
+from surrogates.data.graphs import Graphs
 from surrogates.errors import SurrogateError
-from surrogates.graphs import Graphs
-from surrogates.refinement import Refined
-from surrogates.train import train
+from surrogates.settings import settings as choose
+from surrogates.training.refinement import Refined
+from surrogates.training.train import train
 
 
 def hierarchy() -> Graphs:

@@ -8,10 +8,10 @@ import numpy as np
 import plate
 import pytest
 
-from surrogates.config import settings
-from surrogates.data import Campaign
+from surrogates.data.campaign import Campaign
+from surrogates.data.samples import Notes, Runs, check, split
 from surrogates.errors import SurrogateError
-from surrogates.samples import Notes, Runs, check, split
+from surrogates.settings import settings
 
 
 def changed(where: tuple, value: float) -> Campaign:

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
-from surrogates.config import Settings, parse, settings
 from surrogates.errors import SurrogateError
+from surrogates.settings import Settings, parse, settings
 
 
 def test_the_paper_preset_is_the_papers_network() -> None:

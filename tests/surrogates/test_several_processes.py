@@ -14,7 +14,7 @@ from test_train_command import dataset, hierarchy
 
 import crashkit
 from crashkit.mesh.store import write_hierarchy
-from surrogates.storage import load
+from surrogates.storage.folder import load
 
 
 @pytest.fixture(scope="module")

@@ -20,10 +20,10 @@ from crashkit.errors import DataError
 from crashkit.mesh.levels import Hierarchy, Level
 from crashkit.mesh.store import write_hierarchy
 from crashkit.writers.paraview import read_state
-from surrogates.config import settings
-from surrogates.model import Surrogate
-from surrogates.storage import load
-from surrogates.train import train
+from surrogates.settings import settings
+from surrogates.storage.folder import load
+from surrogates.surrogate import Surrogate
+from surrogates.training.train import train
 
 UNITS = {"impact_speed": "m s-1", "impact_angle": "degree", "yield_stress": "Pa"}
 ASKED = {"impact_speed": 20.0, "impact_angle": "5deg", "yield_stress": "400 MPa"}

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from surrogates.config import settings as choose
 from surrogates.errors import SurrogateError
-from surrogates.storage import load, save
-from surrogates.train import train
+from surrogates.settings import settings as choose
+from surrogates.storage.folder import load, save
+from surrogates.training.train import train
 from surrogates.uncertainty import calibrate, coverage
 
 TIME = np.linspace(0.0, 0.02, 11)

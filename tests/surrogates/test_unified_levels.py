@@ -6,11 +6,11 @@ import numpy as np
 import plate
 import torch
 
-from surrogates.config import settings as choose
-from surrogates.graphs import Graphs
-from surrogates.inputs import InputScaling, Ranges
-from surrogates.train import train
-from surrogates.unified import Unified
+from surrogates.data.graphs import Graphs
+from surrogates.data.inputs import InputScaling, Ranges
+from surrogates.models.unified import Unified
+from surrogates.settings import settings as choose
+from surrogates.training.train import train
 
 
 def unified(*overrides: str) -> Unified:

@@ -9,10 +9,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from surrogates.config import Settings
-from surrogates.data import Campaign
+from surrogates.data.campaign import Campaign
+from surrogates.data.inputs import Ranges
 from surrogates.errors import SurrogateError
-from surrogates.inputs import Ranges
+from surrogates.settings import Settings
 
 # Fewer runs than this cannot spare any for validation.
 FEWEST_TO_SPLIT = 4

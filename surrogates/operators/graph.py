@@ -1,6 +1,6 @@
 """Graph convolutions on states laid out as [node, batch, channel], and the encoder and decoder stacks made of them.
 
-On a CPU, stacks of Chebyshev convolutions run in compiled code (`surrogates.compiled`) where it could be built. What
+On a CPU, stacks of Chebyshev convolutions run in compiled code (`surrogates.operators.compiled`) where it could be built. What
 follows is the same in torch, for everything else.
 
 Inside, a state is held as [channel, node, batch]. Then, without a copy, each channel is a matrix (n, b) for the sparse
@@ -42,9 +42,9 @@ from scipy.sparse.linalg import eigsh
 from torch import Tensor, nn
 from torch.nn import functional
 
-from surrogates import compiled
-from surrogates.chebyshev import of_powers, of_terms
 from surrogates.errors import SurrogateError
+from surrogates.operators import compiled
+from surrogates.operators.chebyshev import of_powers, of_terms
 
 Kind = Literal["cheb", "gcn", "gcn2"]
 Form = Literal["auto", "sparse", "dense"]
@@ -85,7 +85,7 @@ class GraphOperator:
         self.matrix: sparse.csr_matrix = sparse.csr_matrix(matrix)
         self.matrix.sort_indices()
         self._tensors: dict[tuple[torch.device, torch.dtype, int], Tensor] = {}
-        self.compiled: dict[torch.dtype, Any] = {}  # what `surrogates.compiled` made of it
+        self.compiled: dict[torch.dtype, Any] = {}  # what `surrogates.operators.compiled` made of it
 
     def dense_form(self) -> GraphOperator:
         """The same operator held as a dense matrix (n, n), as torch.export and ONNX need it."""

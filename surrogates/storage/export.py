@@ -18,10 +18,10 @@ import torch
 from torch import Tensor, nn
 
 from surrogates.errors import SurrogateError
-from surrogates.model import Surrogate
-from surrogates.network import Network
-from surrogates.operators import exportable
-from surrogates.upsampling import Upsampling
+from surrogates.models.base import Network
+from surrogates.operators.graph import exportable
+from surrogates.operators.upsampling import Upsampling
+from surrogates.surrogate import Surrogate
 
 SUFFIXES = (".onnx", ".pt2")
 # Largest difference to the surrogate itself, relative to its largest displacement, at which a file is accepted.

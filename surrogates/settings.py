@@ -22,7 +22,7 @@ Preset = Literal["fast", "paper"]
 MODELS: tuple[Model, ...] = ("mh", "podnn", "aenn", "gaenn", "pod-gpr", "pod-rbf")
 PRESETS: tuple[Preset, ...] = ("fast", "paper")
 
-# Names of reductions; `surrogates.reduction.register` adds to them.
+# Names of reductions; `surrogates.reductions.reduction.register` adds to them.
 REDUCTIONS = ["gcn", "ae", "pod"]
 
 Positive = Annotated[int, Field(ge=1)]

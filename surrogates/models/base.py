@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
+from surrogates.data.inputs import InputScaling
 from surrogates.errors import SurrogateError
-from surrogates.inputs import InputScaling
 
 
 class Network(nn.Module):

@@ -14,15 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 from torch import Tensor
 
-from surrogates.config import Settings
-from surrogates.data import Campaign
+from surrogates.data.campaign import Campaign
+from surrogates.data.graphs import Graphs
+from surrogates.data.inputs import Ranges
+from surrogates.data.samples import Split
 from surrogates.errors import SurrogateError
-from surrogates.graphs import Graphs
-from surrogates.inputs import Ranges
-from surrogates.loop import Fit
-from surrogates.network import Network
-from surrogates.pod_regression import PodRegression
-from surrogates.samples import Split
+from surrogates.models.base import Network
+from surrogates.models.pod_regression import PodRegression
+from surrogates.settings import Settings
+from surrogates.training.loop import Fit
 from surrogates.uncertainty import Band
 
 # Samples predicted at once.

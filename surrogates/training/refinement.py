@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from surrogates.data import GraphLevel
+from surrogates.data.campaign import GraphLevel
+from surrogates.data.graphs import Graphs
 from surrogates.errors import SurrogateError
-from surrogates.graphs import Graphs
 
 
 @dataclass(frozen=True)

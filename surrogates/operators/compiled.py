@@ -3,7 +3,7 @@
 States come in blocks of 16, laid out as (block, node, channel, lane): what a node's convolution needs then lies together,
 and a lane is a lane of the processor's vectors. Blocks are shared out among threads, and each goes through all layers
 while it is in cache. The library is built when the package is installed; where no compiler was found, or for anything
-but Chebyshev convolutions in float32 or float64 on a CPU, `surrogates.operators` does the same in torch.
+but Chebyshev convolutions in float32 or float64 on a CPU, `surrogates.operators.graph` does the same in torch.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surrogates.chebyshev import of_powers, of_terms
 from surrogates.errors import SurrogateError
+from surrogates.operators.chebyshev import of_powers, of_terms
 
 if TYPE_CHECKING:
-    from surrogates.operators import GraphOperator
+    from surrogates.operators.graph import GraphOperator
 
 LANES = 16
 # Below this many entries at the widest place one thread is done sooner than a second one is woken: 73 nodes at batch 32

@@ -10,20 +10,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from surrogates.cascade import Cascade, build_level
-from surrogates.config import LevelSettings, Settings
-from surrogates.data import Campaign
-from surrogates.graphs import Graphs
-from surrogates.inputs import InputScaling
-from surrogates.level import Level
-from surrogates.loop import Epoch, Fit, Keeper, Objective, fit, set_up
-from surrogates.model import Surrogate, level_name
-from surrogates.objectives import CHUNK, LatentObjective, LevelObjective, Samples, UnifiedObjective, as_states
-from surrogates.process import mix_in
-from surrogates.reduction import LinearReduction, LinearStart, linear_part
-from surrogates.samples import Notes, Runs, Split, scale_of
-from surrogates.starts import pod_start, start_level, start_unified
-from surrogates.unified import Unified
+from surrogates.data.campaign import Campaign
+from surrogates.data.graphs import Graphs
+from surrogates.data.inputs import InputScaling
+from surrogates.data.samples import Notes, Runs, Split, scale_of
+from surrogates.models.cascade import Cascade, build_level
+from surrogates.models.level import Level
+from surrogates.models.unified import Unified
+from surrogates.reductions.reduction import LinearReduction, LinearStart, linear_part
+from surrogates.regression.latent_process import mix_in
+from surrogates.settings import LevelSettings, Settings
+from surrogates.surrogate import Surrogate, level_name
+from surrogates.training.loop import Epoch, Fit, Keeper, Objective, fit, set_up
+from surrogates.training.objectives import CHUNK, LatentObjective, LevelObjective, Samples, UnifiedObjective, as_states
+from surrogates.training.starts import pod_start, start_level, start_unified
 
 
 @dataclass

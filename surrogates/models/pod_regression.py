@@ -16,11 +16,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from surrogates.config import Settings
-from surrogates.data import Campaign
+from surrogates.data.campaign import Campaign
+from surrogates.data.samples import Notes, Runs, Split, scale_of
 from surrogates.errors import SurrogateError
-from surrogates.pod import Pod, pod
-from surrogates.samples import Notes, Runs, Split, scale_of
+from surrogates.reductions.pod import Pod, pod
+from surrogates.settings import Settings
 
 if TYPE_CHECKING:
     from sklearn.gaussian_process.kernels import Kernel

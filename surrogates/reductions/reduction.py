@@ -14,10 +14,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from surrogates.config import REDUCTIONS, LevelSettings
-from surrogates.dense import fully_connected
 from surrogates.errors import SurrogateError
-from surrogates.operators import GraphDecoder, GraphEncoder, GraphOperator
+from surrogates.operators.graph import GraphDecoder, GraphEncoder, GraphOperator
+from surrogates.regression.network import fully_connected
+from surrogates.settings import REDUCTIONS, LevelSettings
 
 
 class Reduction(nn.Module):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import yaml
 
 if TYPE_CHECKING:
-    from surrogates.model import Surrogate
+    from surrogates.surrogate import Surrogate
 
 
 def card(surrogate: Surrogate) -> str:

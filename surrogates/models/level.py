@@ -12,12 +12,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from surrogates.dense import Regressor
 from surrogates.errors import SurrogateError
-from surrogates.network import take_over
-from surrogates.process import LatentProcess
-from surrogates.reduction import LinearReduction, Reduction
-from surrogates.upsampling import Upsampling
+from surrogates.models.base import take_over
+from surrogates.operators.upsampling import Upsampling
+from surrogates.reductions.reduction import LinearReduction, Reduction
+from surrogates.regression.latent_process import LatentProcess
+from surrogates.regression.network import Regressor
 
 
 @dataclass(frozen=True)

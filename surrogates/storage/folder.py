@@ -30,18 +30,18 @@ from safetensors.torch import load_file, save_file
 from scipy import sparse
 from torch import Tensor
 
-from surrogates.card import card
-from surrogates.cascade import Cascade, build_level
-from surrogates.config import Settings, parse
-from surrogates.data import GraphLevel
+from surrogates.data.campaign import GraphLevel
+from surrogates.data.graphs import Graphs
+from surrogates.data.inputs import InputScaling
 from surrogates.errors import ModelFolderError, SurrogateError
-from surrogates.graphs import Graphs
-from surrogates.inputs import InputScaling
-from surrogates.model import Record, Surrogate, record_as_dict, record_from_dict
-from surrogates.network import Network, take_over
-from surrogates.pod_regression import PodRegression
+from surrogates.models.base import Network, take_over
+from surrogates.models.cascade import Cascade, build_level
+from surrogates.models.pod_regression import PodRegression
+from surrogates.models.unified import Unified
+from surrogates.settings import Settings, parse
+from surrogates.storage.card import card
+from surrogates.surrogate import Record, Surrogate, record_as_dict, record_from_dict
 from surrogates.uncertainty import Band
-from surrogates.unified import Unified
 
 FORMAT = 1
 _MAIN = "model.json"

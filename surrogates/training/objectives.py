@@ -9,10 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from surrogates.errors import SurrogateError
-from surrogates.level import Known, Level
-from surrogates.loop import Objective
-from surrogates.reduction import linear_part
-from surrogates.unified import Unified
+from surrogates.models.level import Known, Level
+from surrogates.models.unified import Unified
+from surrogates.reductions.reduction import linear_part
+from surrogates.training.loop import Objective
 
 # Samples handled at once outside training.
 CHUNK = 512

@@ -8,20 +8,20 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogates.cascade import Cascade
-from surrogates.config import Settings
-from surrogates.data import Campaign
+from surrogates.data.campaign import Campaign
+from surrogates.data.graphs import Graphs
+from surrogates.data.inputs import InputScaling, Ranges
+from surrogates.data.samples import Notes, Runs, check, split
 from surrogates.errors import Diverged, SurrogateError
-from surrogates.graphs import Graphs
-from surrogates.inputs import InputScaling, Ranges
-from surrogates.loop import Epoch, Fit, Keeper, device_of
-from surrogates.model import Record, Surrogate
-from surrogates.pod_regression import fit_pod_regression
-from surrogates.refinement import Refined
-from surrogates.samples import Notes, Runs, check, split
-from surrogates.trainer import Trainer
+from surrogates.models.cascade import Cascade
+from surrogates.models.pod_regression import fit_pod_regression
+from surrogates.models.unified import Unified
+from surrogates.settings import Settings
+from surrogates.surrogate import Record, Surrogate
+from surrogates.training.loop import Epoch, Fit, Keeper, device_of
+from surrogates.training.refinement import Refined
+from surrogates.training.trainer import Trainer
 from surrogates.uncertainty import FEWEST_RUNS, calibrate
-from surrogates.unified import Unified
 
 # Bytes of one run on the full mesh up to which lifted predictions are judged.
 _LARGEST_RUN = 2 << 30

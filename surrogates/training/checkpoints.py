@@ -13,9 +13,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from surrogates.config import Settings
-from surrogates.data import Campaign
+from surrogates.data.campaign import Campaign
 from surrogates.errors import SurrogateError
+from surrogates.settings import Settings
 
 _IDENTITY = "training.json"
 _SECONDS = 30.0

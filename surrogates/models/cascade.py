@@ -9,14 +9,14 @@ from typing import Any
 
 from torch import Tensor
 
-from surrogates.config import Settings
-from surrogates.dense import Regressor
-from surrogates.graphs import Graphs
-from surrogates.inputs import InputScaling
-from surrogates.level import Level
-from surrogates.network import Network, in_metres
-from surrogates.reduction import make_reduction
-from surrogates.upsampling import Upsampling
+from surrogates.data.graphs import Graphs
+from surrogates.data.inputs import InputScaling
+from surrogates.models.base import Network, in_metres
+from surrogates.models.level import Level
+from surrogates.operators.upsampling import Upsampling
+from surrogates.reductions.reduction import make_reduction
+from surrogates.regression.network import Regressor
+from surrogates.settings import Settings
 
 
 class Cascade(Network):

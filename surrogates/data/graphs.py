@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from surrogates.data import Campaign, GraphLevel
+from surrogates.data.campaign import Campaign, GraphLevel
 from surrogates.errors import SurrogateError
 
 

@@ -10,14 +10,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from surrogates.config import Settings
-from surrogates.dense import Regressor
+from surrogates.data.graphs import Graphs
+from surrogates.data.inputs import InputScaling
 from surrogates.errors import SurrogateError
-from surrogates.graphs import Graphs
-from surrogates.inputs import InputScaling
-from surrogates.network import Network, in_metres
-from surrogates.reduction import LinearReduction, Reduction, make_reduction
-from surrogates.upsampling import Upsampling
+from surrogates.models.base import Network, in_metres
+from surrogates.operators.upsampling import Upsampling
+from surrogates.reductions.reduction import LinearReduction, Reduction, make_reduction
+from surrogates.regression.network import Regressor
+from surrogates.settings import Settings
 
 
 class Unified(Network):
@@ -121,7 +121,7 @@ class Unified(Network):
 
     def linear_parts(self) -> dict[int, LinearReduction]:
         """Linear parts by level, where reductions have one."""
-        from surrogates.reduction import linear_part
+        from surrogates.reductions.reduction import linear_part
 
         found = {k: linear_part(self.reduction(k)) for k in self._numbers}
         return {k: part for k, part in found.items() if part is not None}

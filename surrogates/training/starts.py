@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surrogates.level import Level
-from surrogates.pod import pod
-from surrogates.reduction import LinearReduction, LinearStart, flat
-from surrogates.unified import Unified
+from surrogates.models.level import Level
+from surrogates.models.unified import Unified
+from surrogates.reductions.pod import pod
+from surrogates.reductions.reduction import LinearReduction, LinearStart, flat
 
 # Gives the training states, some (node, b, 3) at a time, as often as it is called.
 Batches = Callable[[], Iterator[Tensor]]

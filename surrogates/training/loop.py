@@ -18,8 +18,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from surrogates.config import LevelSettings
 from surrogates.errors import Diverged, SurrogateError
+from surrogates.settings import LevelSettings
 
 HISTORY = (
     "total", "approximation", "reconstruction",
@@ -81,7 +81,7 @@ class Fit:
 
 
 class Keeper(Protocol):
-    """Where a training's state goes between epochs; see `surrogates.checkpoints`."""
+    """Where a training's state goes between epochs; see `surrogates.training.checkpoints`."""
 
     def load(self, name: str) -> tuple[dict[str, Tensor], dict[str, Any]] | None: ...
 

@@ -1,0 +1,1 @@
+"""What a surrogate is trained on: campaign, graphs, samples, inputs."""

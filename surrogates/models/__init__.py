@@ -1,0 +1,1 @@
+"""One level, the cascade of levels, all levels at once, POD regression."""

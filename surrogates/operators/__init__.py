@@ -1,0 +1,1 @@
+"""Graph operators, convolutions, upsampling, and the compiled path."""

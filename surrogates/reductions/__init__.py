@@ -1,0 +1,1 @@
+"""From states to latent vectors and back: graph, dense, POD."""

@@ -1,0 +1,1 @@
+"""From parameters and time to latent vectors: network, Gaussian process, latent process."""

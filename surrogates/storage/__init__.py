@@ -1,0 +1,1 @@
+"""A surrogate as a folder: weights, card, export."""

@@ -1,0 +1,1 @@
+"""From a campaign to a surrogate: starts, objectives, the loop, checkpoints, refinement."""
