@@ -45,9 +45,10 @@ from surrogates.data.inputs import InputScaling, Ranges
 from surrogates.data.samples import Split
 from surrogates.models.cascade import Cascade, build_level
 from surrogates.models.level import Level
+from surrogates.record import Record
 from surrogates.regression.latent_process import LatentProcess
 from surrogates.settings import Settings, settings
-from surrogates.surrogate import Record, Surrogate
+from surrogates.surrogate import Surrogate
 
 STATES, RUNS, GOAL = 101, 84, 3.0
 PARAMETERS = np.array([[10.0, -10.0, 2e8], [30.0, 10.0, 5e8]])

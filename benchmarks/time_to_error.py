@@ -27,7 +27,7 @@ from typing import Any
 
 import torch
 
-from crashkit.cli.train import train
+from crashkit.api.train import train
 from surrogates.settings import settings
 from surrogates.storage.folder import load
 from surrogates.surrogate import Surrogate
@@ -39,7 +39,7 @@ DEMO_NODES, DEMO_TEST = [300, 75, 19], "27:36"
 
 def demo_dataset(path: Path) -> Path:
     """The embedded runs with their hierarchy, made once."""
-    from crashkit.cli.coarsen import coarsen
+    from crashkit.api.coarsen import coarsen
     from crashkit.dataset import demo_data
     from crashkit.ingestion.ingest import ingest
 

@@ -38,7 +38,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch_geometric.nn import ChebConv as PeerConv
 
-from surrogates.operators.graph import GraphDecoder, GraphEncoder, GraphOperator
+from surrogates.operators.graph import GraphOperator
+from surrogates.operators.stacks import GraphDecoder, GraphEncoder
 
 BATCH, LATENT, CHANNELS, ORDER = 32, 4, (3, 6, 12, 24), 3
 GOAL = 10.0

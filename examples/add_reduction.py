@@ -10,7 +10,7 @@ from pathlib import Path
 
 from torch import Tensor, nn
 
-from crashkit.cli.train import train
+from crashkit.api.train import train
 from surrogates.reductions.reduction import Reduction, flat, register, unflat
 from surrogates.settings import LevelSettings
 

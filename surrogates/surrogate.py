@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import datetime
-import platform
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
-from typing import Any
 
 import numpy as np
 import torch
@@ -14,13 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 from torch import Tensor
 
-from surrogates.data.campaign import Campaign
 from surrogates.data.graphs import Graphs
-from surrogates.data.inputs import Ranges
-from surrogates.data.samples import Split
 from surrogates.errors import SurrogateError
 from surrogates.models.base import Network
 from surrogates.models.pod_regression import PodRegression
+from surrogates.operators.convolutions import exportable
+from surrogates.record import Record
 from surrogates.settings import Settings
 from surrogates.training.loop import Fit
 from surrogates.uncertainty import Band
@@ -33,50 +28,6 @@ _NAMES = {"podnn": "PODNN", "aenn": "AENN", "gaenn": "GAENN", "pod-gpr": "POD-GP
 def level_name(settings: Settings, number: int) -> str:
     """What tables call the level: MH1, MH2, .. or the baseline's name."""
     return _NAMES.get(settings.model, f"MH{number}")
-
-
-@dataclass
-class Record:
-    """Where a surrogate comes from and how its training went.
-
-    ranges      names, units and ranges of the parameters, and of the time, over the runs it was fitted to
-    time        (state,) s, the states it was trained on
-    fits        how each level's training went
-    errors      e2 (m) by what was measured, on validation runs, on the level's own nodes
-    choice      what a POD regression chose on the validation runs: inputs and modes
-    notes       what was unusual about the data
-    """
-
-    ranges: Ranges
-    time: NDArray[np.float64]
-    checksum: str
-    fitted_runs: tuple[str, ...]
-    validation_runs: tuple[str, ...]
-    held_out_runs: tuple[str, ...]
-    seed: int
-    created: str
-    versions: dict[str, str]
-    attributes: dict[str, str]
-    fits: dict[int, Fit] = field(default_factory=dict)
-    errors: dict[str, float] = field(default_factory=dict)
-    choice: dict[str, Any] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-
-    @classmethod
-    def of(cls, campaign: Campaign, settings: Settings, ranges: Ranges, split: Split) -> Record:
-        names = campaign.runs or tuple(str(k) for k in range(len(campaign.parameters)))
-        return cls(
-            ranges=ranges,
-            time=np.asarray(campaign.time, np.float64),
-            checksum=campaign.checksum,
-            fitted_runs=tuple(names[k] for k in split.training),
-            validation_runs=tuple(names[k] for k in split.validation),
-            held_out_runs=campaign.held_out,
-            seed=settings.seed,
-            created=datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
-            versions=_versions(),
-            attributes=dict(campaign.attributes or {}),
-        )
 
 
 class Surrogate:
@@ -194,9 +145,7 @@ class Surrogate:
         level: int | None = None,
         nodes: ArrayLike | None = None,
     ) -> NDArray[np.float32]:
-        """Derivatives by the parameters (state, node, 3, parameter); see `surrogates.uncertainty.sensitivity`."""
-        from surrogates.uncertainty import sensitivity
-
+        """Derivatives by the parameters (state, node, 3, parameter); see `surrogates.surrogate.sensitivity`."""
         return sensitivity(self, parameters, time, level, nodes)
 
     def outside(self, parameters: ArrayLike, time: ArrayLike | None = None) -> list[str]:
@@ -279,56 +228,62 @@ class Surrogate:
         return values, times
 
 
-def record_as_dict(record: Record) -> dict[str, Any]:
-    """Plain values for JSON, without the histories."""
-    ranges = record.ranges
-    out = asdict(record)
-    out["ranges"] = {
-        "names": list(ranges.names), "units": list(ranges.units), "low": ranges.low.tolist(),
-        "high": ranges.high.tolist(), "time": list(ranges.time),
-    }  # fmt: skip
-    out["time"] = record.time.tolist()
-    out["fits"] = {
-        str(k): {"best_epoch": f.best_epoch, "best": f.best, "seconds": f.seconds, "status": f.status}
-        for k, f in record.fits.items()
-    }
-    return out
+def sensitivity(
+    surrogate: Surrogate,
+    parameters: ArrayLike,
+    time: ArrayLike | None = None,
+    level: int | None = None,
+    nodes: ArrayLike | None = None,
+) -> NDArray[np.float32]:
+    """Derivatives of displacements by the parameters, m per unit of the parameter: (state, node, 3, parameter).
+
+    parameters  (parameter,), time (state,) s and level as in `Surrogate.predict`
+    nodes       node numbers on the level; default: all
+
+    Networks are differentiated automatically, in forward mode; Gaussian processes and radial basis functions by central
+    differences over a thousandth of the trained range.
+    """
+    number = surrogate.number(level)
+    values, times = surrogate.checked(parameters, time)
+    if len(values) != 1:
+        raise SurrogateError(f"sensitivities are those of one run; found parameters of {len(values)}")
+    chosen = slice(None) if nodes is None else np.atleast_1d(np.asarray(nodes))
+    columns = []
+    for k in range(values.shape[1]):
+        core = surrogate.core
+        moved = (
+            _forward_mode(core, values[0], times, number, k)
+            if isinstance(core, Network)
+            else _central(surrogate, values[0], times, number, k)
+        )
+        columns.append(moved[:, chosen])
+    return np.stack(columns, axis=-1).astype(np.float32)
 
 
-def record_from_dict(values: Mapping[str, Any], histories: Mapping[int, dict[str, list[float]]]) -> Record:
-    """The way back; raises KeyError or TypeError where something is missing."""
-    ranges = values["ranges"]
-    return Record(
-        ranges=Ranges(
-            tuple(ranges["names"]), tuple(ranges["units"]), np.array(ranges["low"], np.float64),
-            np.array(ranges["high"], np.float64), (float(ranges["time"][0]), float(ranges["time"][1])),
-        ),
-        time=np.array(values["time"], np.float64),
-        checksum=values["checksum"],
-        fitted_runs=tuple(values["fitted_runs"]),
-        validation_runs=tuple(values["validation_runs"]),
-        held_out_runs=tuple(values["held_out_runs"]),
-        seed=int(values["seed"]),
-        created=values["created"],
-        versions=dict(values["versions"]),
-        attributes=dict(values["attributes"]),
-        fits={
-            int(k): Fit(histories.get(int(k), {}), f["best_epoch"], f["best"], f["seconds"], f["status"])
-            for k, f in values["fits"].items()
-        },
-        errors=dict(values["errors"]),
-        choice=dict(values["choice"]),
-        notes=list(values["notes"]),
-    )  # fmt: skip
+def _forward_mode(
+    network: Network, values: NDArray[np.float64], times: NDArray[np.float64], number: int, k: int
+) -> NDArray[np.floating]:
+    at = torch.from_numpy(values).expand(len(times), -1)
+    direction = torch.zeros_like(at)
+    direction[:, k] = 1.0
+    when = torch.from_numpy(times)
+
+    def states(parameters: Tensor) -> Tensor:
+        return network(parameters, when, number)
+
+    with exportable(network), torch.no_grad():
+        moved = torch.func.jvp(states, (at.contiguous(),), (direction,))[1]
+    return moved.transpose(0, 1).numpy()
 
 
-def _versions() -> dict[str, str]:
-    from importlib.metadata import PackageNotFoundError, version
-
-    out = {"python": platform.python_version()}
-    for name in ("crashkit", "torch", "numpy", "scipy", "scikit-learn", "safetensors"):
-        try:
-            out[name] = version(name)
-        except PackageNotFoundError:
-            out[name] = "unknown"
-    return out
+def _central(
+    surrogate: Surrogate, values: NDArray[np.float64], times: NDArray[np.float64], number: int, k: int
+) -> NDArray[np.floating]:
+    ranges = surrogate.record.ranges
+    step = 1e-3 * (ranges.high[k] - ranges.low[k])
+    if step == 0:
+        return np.zeros((len(times), surrogate.graphs.n_nodes(number), 3))
+    there = np.repeat(values[None], 2, axis=0)
+    there[:, k] += (-step, step)
+    states = surrogate.predict(there, times, number).astype(np.float64)
+    return (states[1] - states[0]) / (2 * step)

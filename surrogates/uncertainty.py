@@ -14,16 +14,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from numpy.typing import ArrayLike, NDArray
-from torch import Tensor
+from numpy.typing import NDArray
 
 from surrogates.errors import SurrogateError
-from surrogates.models.base import Network
-from surrogates.operators.graph import exportable
 
 if TYPE_CHECKING:
-    from surrogates.surrogate import Surrogate
+    pass
 
 # Fewer validation runs than this leave no other run to estimate the scale on.
 FEWEST_RUNS = 2
@@ -80,67 +76,6 @@ def calibrate(distances: Sequence[NDArray[np.float32]], time: NDArray[np.float64
 def coverage(distances: NDArray[np.float32], half_width: NDArray[np.float32]) -> float:
     """The share of nodes and states (..., state, node) whose distance is at most the half-width (state, node)."""
     return float((distances <= half_width).mean())
-
-
-def sensitivity(
-    surrogate: Surrogate,
-    parameters: ArrayLike,
-    time: ArrayLike | None = None,
-    level: int | None = None,
-    nodes: ArrayLike | None = None,
-) -> NDArray[np.float32]:
-    """Derivatives of displacements by the parameters, m per unit of the parameter: (state, node, 3, parameter).
-
-    parameters  (parameter,), time (state,) s and level as in `Surrogate.predict`
-    nodes       node numbers on the level; default: all
-
-    Networks are differentiated automatically, in forward mode; Gaussian processes and radial basis functions by central
-    differences over a thousandth of the trained range.
-    """
-    number = surrogate.number(level)
-    values, times = surrogate.checked(parameters, time)
-    if len(values) != 1:
-        raise SurrogateError(f"sensitivities are those of one run; found parameters of {len(values)}")
-    chosen = slice(None) if nodes is None else np.atleast_1d(np.asarray(nodes))
-    columns = []
-    for k in range(values.shape[1]):
-        core = surrogate.core
-        moved = (
-            _forward_mode(core, values[0], times, number, k)
-            if isinstance(core, Network)
-            else _central(surrogate, values[0], times, number, k)
-        )
-        columns.append(moved[:, chosen])
-    return np.stack(columns, axis=-1).astype(np.float32)
-
-
-def _forward_mode(
-    network: Network, values: NDArray[np.float64], times: NDArray[np.float64], number: int, k: int
-) -> NDArray[np.floating]:
-    at = torch.from_numpy(values).expand(len(times), -1)
-    direction = torch.zeros_like(at)
-    direction[:, k] = 1.0
-    when = torch.from_numpy(times)
-
-    def states(parameters: Tensor) -> Tensor:
-        return network(parameters, when, number)
-
-    with exportable(network), torch.no_grad():
-        moved = torch.func.jvp(states, (at.contiguous(),), (direction,))[1]
-    return moved.transpose(0, 1).numpy()
-
-
-def _central(
-    surrogate: Surrogate, values: NDArray[np.float64], times: NDArray[np.float64], number: int, k: int
-) -> NDArray[np.floating]:
-    ranges = surrogate.record.ranges
-    step = 1e-3 * (ranges.high[k] - ranges.low[k])
-    if step == 0:
-        return np.zeros((len(times), surrogate.graphs.n_nodes(number), 3))
-    there = np.repeat(values[None], 2, axis=0)
-    there[:, k] += (-step, step)
-    states = surrogate.predict(there, times, number).astype(np.float64)
-    return (states[1] - states[0]) / (2 * step)
 
 
 def _scale(

@@ -33,7 +33,7 @@ class RunField:
 
 
 def open_campaign(path: str | Path, test: Any = None) -> Campaign:
-    """The runs of the dataset at `path` without the test runs, as `crashkit.dataset.runs_of` understands `test`.
+    """The runs of the dataset at `path` without the test runs, as `crashkit.selection.runs_of` understands `test`.
 
     The full field is read run by run by those models that need it; the cascade reads its levels only.
 
@@ -41,9 +41,10 @@ def open_campaign(path: str | Path, test: Any = None) -> Campaign:
     """
     import numpy as np
 
-    from crashkit.dataset import open_dataset, runs_of
+    from crashkit.dataset import open_dataset
     from crashkit.errors import DataError
     from crashkit.mesh.store import level_displacement
+    from crashkit.selection import runs_of
     from data_schema import fields, parameters
     from surrogates.data.campaign import Campaign
 

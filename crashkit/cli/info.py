@@ -102,8 +102,7 @@ def _bytes(path: Path) -> int:
 
 
 def _levels(path: Path) -> list[dict[str, Any]]:
-    from crashkit.dataset import has_hierarchy
-    from crashkit.mesh.store import summarize_hierarchy
+    from crashkit.mesh.store import has_hierarchy, summarize_hierarchy
 
     return list(summarize_hierarchy(path)) if has_hierarchy(path) else []
 

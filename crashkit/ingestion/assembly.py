@@ -51,7 +51,8 @@ class Existing:
         """The dataset at `path`, None if nothing is there. Raises OutputError if it is something else."""
         if not path.exists():
             return None
-        from crashkit.dataset import has_hierarchy, open_dataset
+        from crashkit.dataset import open_dataset
+        from crashkit.mesh.store import has_hierarchy
 
         try:
             dataset = open_dataset(path, chunks=None)

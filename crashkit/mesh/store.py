@@ -30,6 +30,13 @@ from crashkit.readers.base import split_states
 
 if TYPE_CHECKING:
     import xarray as xr
+from typing import TYPE_CHECKING
+
+import xarray as xr
+
+if TYPE_CHECKING:
+    from crashkit.mesh.levels import Hierarchy
+
 
 # Bytes of displacement held at once while streaming: mostly a whole run, since its chunks hold all states.
 _BUDGET = 512 << 20
@@ -456,3 +463,21 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
+
+
+def has_hierarchy(path: str | Path) -> bool:
+    """Whether the dataset at `path` has a mesh hierarchy."""
+    path = Path(path)
+    if path.is_dir():
+        return (path / "hierarchy").is_dir()
+    import netCDF4
+
+    with netCDF4.Dataset(str(path)) as file:
+        return "hierarchy" in file.groups
+
+
+def open_hierarchy(path: str | Path) -> Hierarchy:
+    """The mesh hierarchy of the dataset at `path`; raises DataError if it has none."""
+    from crashkit.mesh.store import read_hierarchy
+
+    return read_hierarchy(path)

@@ -16,8 +16,8 @@ import crashkit
 from crashkit.mesh.store import level_displacement
 from data_schema import parameters
 from evaluation.measures.rigid import RigidMotion, fit_rigid
-from surrogates.models.pod_regression import Gaussian
 from surrogates.reductions.pod import pod
+from surrogates.regression.gaussian import Gaussian
 
 LEVEL, MODES, FOLDS = 2, 48, 4
 

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from surrogates.errors import SurrogateError
-from surrogates.operators.graph import GraphDecoder, GraphEncoder, GraphOperator
+from surrogates.operators.graph import GraphOperator
+from surrogates.operators.stacks import GraphDecoder, GraphEncoder
 from surrogates.regression.network import fully_connected
 from surrogates.settings import REDUCTIONS, LevelSettings
 

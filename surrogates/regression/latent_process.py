@@ -3,7 +3,7 @@
 Runs are the samples and one kernel serves all outputs, so a prediction is a weighted sum of the training runs' courses;
 between trained states these are cubic. On few runs it errs differently from a network, and their mean is better than
 either. In torch, hence differentiable by the parameters and exportable.
-Source of the kernel's numbers: `surrogates.models.pod_regression.Gaussian` (Rasmussen and Williams 2006, equation 5.8).
+Source of the kernel's numbers: `surrogates.regression.gaussian.Gaussian` (Rasmussen and Williams 2006, equation 5.8).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from surrogates.models.pod_regression import Gaussian
+from surrogates.regression.gaussian import Gaussian
 
 if TYPE_CHECKING:
     from sklearn.gaussian_process.kernels import Kernel

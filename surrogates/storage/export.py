@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from surrogates.errors import SurrogateError
 from surrogates.models.base import Network
-from surrogates.operators.graph import exportable
+from surrogates.operators.convolutions import exportable
 from surrogates.operators.upsampling import Upsampling
 from surrogates.surrogate import Surrogate
 

@@ -38,9 +38,10 @@ from surrogates.models.base import Network, take_over
 from surrogates.models.cascade import Cascade, build_level
 from surrogates.models.pod_regression import PodRegression
 from surrogates.models.unified import Unified
+from surrogates.record import Record, record_as_dict, record_from_dict
 from surrogates.settings import Settings, parse
 from surrogates.storage.card import card
-from surrogates.surrogate import Record, Surrogate, record_as_dict, record_from_dict
+from surrogates.surrogate import Surrogate
 from surrogates.uncertainty import Band
 
 FORMAT = 1

@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from surrogates.errors import Diverged, SurrogateError
+from surrogates.errors import SurrogateError
 from surrogates.settings import LevelSettings
 
 HISTORY = (
@@ -351,3 +351,14 @@ def _diverged(name: str, epoch: int, out: Fit) -> Diverged:
     )
     error.fit = out
     return error
+
+
+class Diverged(SurrogateError):
+    """A loss became NaN or infinite; names the model, level and epoch. The last good weights are kept.
+
+    fit        how the training went until then
+    surrogate  what can be used: the finished levels, and this one with its best weights; None without any
+    """
+
+    fit: Fit | None = None
+    surrogate: Any = None  # a surrogates.surrogate.Surrogate, which is built on this module

@@ -12,13 +12,14 @@ from surrogates.data.campaign import Campaign
 from surrogates.data.graphs import Graphs
 from surrogates.data.inputs import InputScaling, Ranges
 from surrogates.data.samples import Notes, Runs, check, split
-from surrogates.errors import Diverged, SurrogateError
+from surrogates.errors import SurrogateError
 from surrogates.models.cascade import Cascade
 from surrogates.models.pod_regression import fit_pod_regression
 from surrogates.models.unified import Unified
+from surrogates.record import Record
 from surrogates.settings import Settings
-from surrogates.surrogate import Record, Surrogate
-from surrogates.training.loop import Epoch, Fit, Keeper, device_of
+from surrogates.surrogate import Surrogate
+from surrogates.training.loop import Diverged, Epoch, Fit, Keeper, device_of
 from surrogates.training.refinement import Refined
 from surrogates.training.trainer import Trainer
 from surrogates.uncertainty import FEWEST_RUNS, calibrate

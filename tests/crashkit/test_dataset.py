@@ -17,9 +17,10 @@ from hypothesis import strategies as st
 from memory_runs import MemoryRun, RunsInMemory
 
 import crashkit
-from crashkit.dataset import dataset_checksum, demo_data, open_dataset, reading, runs_of
+from crashkit.dataset import dataset_checksum, demo_data, open_dataset, reading
 from crashkit.errors import DataError, ReadError
 from crashkit.ingestion.ingest import ingest
+from crashkit.selection import runs_of
 
 NAMES = [f"run_{k:03d}" for k in range(10)]
 

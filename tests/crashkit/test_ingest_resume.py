@@ -269,8 +269,8 @@ class TestSecondIngest:
         assert open_dataset(tmp_path / f"crash{suffix}").sizes["time"] == 3
 
     def test_hierarchy_of_the_old_runs_goes_and_it_is_said(self, tmp_path: Path, sources, suffix: str) -> None:  # type: ignore[no-untyped-def]
-        from crashkit.cli.coarsen import coarsen
-        from crashkit.dataset import has_hierarchy
+        from crashkit.api.coarsen import coarsen
+        from crashkit.mesh.store import has_hierarchy
 
         output = tmp_path / f"crash{suffix}"
         self.ingest(tmp_path, suffix, sources[0])

@@ -22,8 +22,8 @@ RUNS, STATES = 8, slice(0, 21, 4)
 @pytest.fixture(scope="module")
 def campaign(tmp_path_factory) -> Path:
     """A folder with a dataset of eight real runs and two trained models that hold the last three runs out."""
-    from crashkit.cli.coarsen import coarsen
-    from crashkit.cli.train import train
+    from crashkit.api.coarsen import coarsen
+    from crashkit.api.train import train
     from crashkit.ingestion.ingest import ingest
 
     folder = tmp_path_factory.mktemp("campaign")
@@ -79,8 +79,8 @@ def test_the_whole_way(campaign, small, tmp_path):
 
 
 def test_numbers_are_those_of_asking_the_model(campaign, small, tmp_path):
-    from crashkit.cli.evaluate import evaluate
-    from crashkit.cli.predict import load_model
+    from crashkit.api.evaluate import evaluate
+    from crashkit.api.predict import load_model
 
     result = evaluate(campaign / "kart.zarr", [campaign / "podnn"], tmp_path / "report")
     model, data = load_model(campaign / "podnn"), open_dataset(campaign / "kart.zarr")
@@ -94,7 +94,7 @@ def test_numbers_are_those_of_asking_the_model(campaign, small, tmp_path):
 
 
 def test_two_workers_find_exactly_the_same(campaign, small, tmp_path):
-    from crashkit.cli.evaluate import evaluate
+    from crashkit.api.evaluate import evaluate
 
     both = [evaluate(campaign / "kart.zarr", [campaign / "mh0"], tmp_path / f"by-{n}", workers=n) for n in (1, 2)]
     for label in ("MH1", "MH2"):
@@ -164,7 +164,7 @@ def test_a_run_with_lost_values_is_named(campaign, tmp_path):
 
 
 def test_a_hierarchy_made_anew_is_noticed(campaign, tmp_path):
-    from crashkit.cli.coarsen import coarsen
+    from crashkit.api.coarsen import coarsen
 
     shutil.copytree(campaign / "kart.zarr", tmp_path / "kart.zarr")
     coarsen(tmp_path / "kart.zarr", [61, 17])

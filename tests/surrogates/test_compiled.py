@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from surrogates.operators import compiled
-from surrogates.operators.graph import GraphDecoder, GraphEncoder, GraphOperator
+from surrogates.operators.graph import GraphOperator
+from surrogates.operators.stacks import GraphDecoder, GraphEncoder
 
 
 def graph(n_nodes: int, seed: int = 0) -> GraphOperator:

@@ -11,7 +11,7 @@ import torch
 from scipy.interpolate import CubicHermiteSpline
 
 from surrogates.models.cascade import Cascade
-from surrogates.models.pod_regression import Gaussian
+from surrogates.regression.gaussian import Gaussian
 from surrogates.regression.latent_process import LatentProcess, fit_process
 from surrogates.settings import settings
 from surrogates.storage.folder import load, save

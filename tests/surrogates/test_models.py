@@ -10,13 +10,13 @@ import plate
 import pytest
 import torch
 
-from surrogates.errors import Diverged, SurrogateError
+from surrogates.errors import SurrogateError
 from surrogates.models.cascade import Cascade
 from surrogates.settings import settings
 from surrogates.storage.folder import load, save
 from surrogates.surrogate import Surrogate
 from surrogates.training.checkpoints import Checkpoints
-from surrogates.training.loop import Epoch
+from surrogates.training.loop import Diverged, Epoch
 from surrogates.training.train import train
 
 SHORT = ("level.epochs=4", "transfer.epochs=1", "level.batch=16")

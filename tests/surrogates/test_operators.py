@@ -12,18 +12,9 @@ from torch_geometric.nn import GCN2Conv as PeerGCN2
 from torch_geometric.nn import GCNConv as PeerGCN
 
 from surrogates.errors import SurrogateError
-from surrogates.operators.graph import (
-    WIDE_UP_TO,
-    ChebConv,
-    GCN2Conv,
-    GCNConv,
-    GraphDecoder,
-    GraphEncoder,
-    GraphOperator,
-    exportable,
-    largest_eigenvalue,
-    normalised_laplacian,
-)
+from surrogates.operators.convolutions import ChebConv, GCN2Conv, GCNConv, exportable
+from surrogates.operators.graph import WIDE_UP_TO, GraphOperator, largest_eigenvalue, normalised_laplacian
+from surrogates.operators.stacks import GraphDecoder, GraphEncoder
 
 DOUBLE = torch.float64
 

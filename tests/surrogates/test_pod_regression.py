@@ -10,7 +10,8 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 
 from surrogates.data.campaign import Campaign
 from surrogates.errors import SurrogateError
-from surrogates.models.pod_regression import Gaussian, PodRegression, RadialBasis, _kernel
+from surrogates.models.pod_regression import PodRegression
+from surrogates.regression.gaussian import Gaussian, RadialBasis, _kernel
 from surrogates.settings import settings
 from surrogates.training.train import train
 

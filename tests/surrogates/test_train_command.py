@@ -14,8 +14,8 @@ import xarray as xr
 from typer.testing import CliRunner
 
 import crashkit
+from crashkit.api.predict import predict
 from crashkit.cli import app
-from crashkit.cli.predict import predict
 from crashkit.errors import DataError
 from crashkit.mesh.levels import Hierarchy, Level
 from crashkit.mesh.store import write_hierarchy

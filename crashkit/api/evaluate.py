@@ -1,0 +1,345 @@
+"""Compare stored models on test runs, and write the report and the ParaView files."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+    import xarray as xr
+    from numpy.typing import NDArray
+
+    from evaluation.comparison.predictor import Mesh, Model
+    from evaluation.comparison.reference import Reference
+    from evaluation.comparison.result import Evaluation
+    from evaluation.comparison.scoring import RunScores
+    from evaluation.comparison.sensors import Sensors
+    from surrogates.surrogate import Surrogate
+
+
+Progress = Callable[[str, int, int], None]  # what is being done, steps done, steps in all
+
+
+def evaluate(
+    dataset: str | Path,
+    models: Sequence[str | Path],
+    output: str | Path,
+    *,
+    test: Sequence[str] | None = None,
+    write_vtu: bool = False,
+    vtk_runs: Sequence[str] | None = None,
+    probes: Sequence[int] | None = None,
+    intrusion: tuple[str, str] | None = None,
+    workers: int = 1,
+    scheduler: str | None = None,
+    seeds_as_spread: bool = True,
+    report: Progress | None = None,
+) -> Evaluation:
+    """Compare stored models on runs none of them has seen, and write everything into the folder `output`.
+
+    dataset    path of a crash dataset (.zarr or .nc), with a hierarchy where models work on coarse levels
+    models     model folders; those that differ only in their seed become one row with its spread
+    test       names of the test runs; default: those that all the models hold out
+    write_vtu  also write PVD + VTU and VTKHDF with truth, prediction and error
+    vtk_runs   the runs written so; default: the worst and the median run of the best model
+    probes     the solver's numbers of nodes whose histories are compared; default: four spread over the structure
+    intrusion  name of a part and a direction (x, -x, y, -y, z or -z); default: the whole structure, against its motion
+    workers    processes that share the runs; `scheduler`, the address of a Dask scheduler, is used instead
+    report     called with what is being done and how far it is
+
+    The folder appears under its name when it is complete. Peak memory is one run a worker.
+
+    Raises EvaluationError where the comparison would not be honest or the models do not fit the data, DataError,
+    ReadError and ModelFolderError where files are not what they should be, OutputError where `output` cannot be
+    written.
+    """
+    from crashkit.output import complete_folder
+    from evaluation.comparison.result import compare, decompose
+    from evaluation.comparison.sensors import choose_sensors
+    from evaluation.comparison.split import agree_on_split, entries
+    from evaluation.comparison.streaming import over_runs
+    from evaluation.figures import kinds
+    from evaluation.report.files import default_runs, write_run
+    from evaluation.report.report import write_report
+
+    tell = report or (lambda what, done, total: None)
+    paths = (str(dataset), tuple(map(str, models)))
+    reference, stored = _opened(*paths)
+    split = agree_on_split(reference, stored, test)
+    entries(stored, seeds_as_spread)  # refuses what cannot be compared before anything is computed
+    reference.index(vtk_runs or ())
+    sensors = choose_sensors(reference, probes, intrusion)
+    with complete_folder(Path(output), "report.json") as folder:
+        with _counted(tell, "modes of the training runs", len(split.train)) as step:
+            pods = decompose(reference, split.train, done=step)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".modes-") as kept:
+            job = ScoreJob(*paths, _keep_modes(pods, Path(kept)), sensors)
+            _HELD[job.modes[0]] = (reference, stored)  # what is open here need not be opened again
+            with _counted(tell, "test runs", len(split.test)) as step:
+                try:
+                    scored = over_runs(job, split.test, workers, scheduler, done=step)
+                finally:
+                    _HELD.clear()
+        result = compare(
+            reference, stored, split, seeds_as_spread=seeds_as_spread, pods=pods, scored=scored,
+            sensors=sensors, context=_context(Path(dataset), reference, stored, split),
+        )  # fmt: skip
+        if write_vtu:
+            runs = reference.index(vtk_runs) if vtk_runs else default_runs(result)
+            with _counted(tell, "runs for ParaView", len(runs)) as step:
+                written = []
+                for run in runs:
+                    written += write_run(result, run, folder / "vtk")
+                    step(run)
+            result = dataclasses.replace(result, files=tuple(written))
+        with _counted(tell, "figures", len(kinds())) as step:
+            write_report(result, folder, done=lambda name: step(0))
+    return result
+
+
+# Evaluation -> its dataset and models, opened once a process.
+_HELD: dict[str, tuple[Reference, tuple[Model, ...]]] = {}
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Sums in one order: how many threads share a product must not decide the last bits of a table."""
+    import torch
+    from threadpoolctl import threadpool_limits
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1):
+            yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@dataclass(frozen=True)
+class ScoreJob:
+    """Scoring one run, to be sent to another process: it opens the files there, once a process."""
+
+    dataset: str
+    models: tuple[str, ...]
+    modes: Mapping[int, str]
+    sensors: Sensors
+
+    def __call__(self, run: int) -> RunScores:
+        import numpy as np
+
+        from evaluation.comparison.result import default_groups, predictors_of
+        from evaluation.comparison.scoring import score_run
+
+        evaluation = self.modes[0]  # a folder of its own, so its path names the evaluation
+        if evaluation not in _HELD:
+            _HELD.clear()
+            _HELD[evaluation] = _opened(self.dataset, self.models)
+        reference, models = _HELD[evaluation]
+        modes = {level: np.load(path, mmap_mode="r", allow_pickle=False) for level, path in self.modes.items()}
+        with _one_thread():
+            return score_run(reference, predictors_of(models), run, modes, default_groups(reference)[0], self.sensors)
+
+
+def _keep_modes(pods: Mapping[int, Any], folder: Path) -> dict[int, str]:
+    """Modes as files, which workers map into memory instead of being sent them with every run."""
+    import numpy as np
+
+    out = {}
+    for level, pod in pods.items():
+        path = folder.absolute() / f"level_{level}.npy"
+        np.save(path, pod.modes, allow_pickle=False)
+        out[level] = str(path)
+    return out
+
+
+def _opened(dataset: str, models: tuple[str, ...]) -> tuple[Reference, tuple[Model, ...]]:
+    """The dataset and the models as evaluation sees them."""
+    from crashkit.api.predict import load_model
+    from crashkit.dataset import open_dataset
+    from crashkit.mesh.store import has_hierarchy, read_hierarchy
+    from evaluation.comparison.reference import reference_of
+
+    surrogates = [(Path(folder), load_model(folder)) for folder in models]
+    opened = open_dataset(dataset, chunks=None)
+    coarse = any(number > 0 for _, s in surrogates for number in s.level_names.values())
+    levels = read_hierarchy(dataset).levels if coarse or has_hierarchy(dataset) else ()
+    reference = reference_of(opened, levels)
+    reference = dataclasses.replace(reference, displacement=_reader(dataset, opened))
+    return reference, tuple(as_model(surrogate, folder, reference) for folder, surrogate in surrogates)
+
+
+def _reader(path: str, dataset: xr.Dataset) -> Callable[[int], NDArray[np.float32]]:
+    """Reads one run (state, node, 3), m; raises ReadError where it is damaged."""
+    import numpy as np
+
+    from crashkit.dataset import reading
+    from crashkit.errors import ReadError
+
+    erodes = "alive" in dataset or "cell_alive" in dataset
+
+    def read(run: int) -> NDArray[np.float32]:
+        with reading(path):
+            u = np.asarray(dataset["displacement"].isel(sim=run).values)
+        if not erodes and not np.isfinite(u).all():
+            raise ReadError(
+                f"{path}: displacements of run {dataset['sim'].values[run]} are missing though nothing erodes; expected "
+                f"numbers everywhere: see crashkit validate, and ingest the run again"
+            )
+        return u
+
+    return read
+
+
+@dataclass
+class StoredLevel:
+    """One level of a stored surrogate as evaluation asks it (evaluation.comparison.predictor.Predictor).
+
+    order  for each parameter of the surrogate, its place among those of the dataset
+    """
+
+    surrogate: Surrogate
+    name: str
+    level: int
+    mesh: Mesh | None
+    order: tuple[int, ...]
+    n_parameters: int
+    n_latent: int
+    seconds_per_epoch: float
+    training_seconds: float
+    history: Mapping[str, NDArray[np.float64]]
+
+    def predict(self, parameters: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float32]:
+        return self.surrogate.predict(parameters[list(self.order)], time, self.level)
+
+    def reconstruct(self, displacement: NDArray[np.float32]) -> NDArray[np.float32]:
+        return self.surrogate.reconstruct(displacement, self.level)
+
+    def half_width(self, share: float, time: NDArray[np.float64]) -> NDArray[np.float32] | None:
+        known = self.surrogate.has_band(self.level)
+        return self.surrogate.band(share, time, self.level, full=True) if known else None
+
+
+def as_model(surrogate: Surrogate, folder: Path, reference: Reference) -> Model:
+    """A surrogate, stored in `folder`, as evaluation sees it: one predictor a level, and the runs it has seen.
+
+    Raises EvaluationError where its parameters, nodes or levels are not those of the dataset.
+    """
+    from evaluation.comparison.predictor import Model
+    from evaluation.errors import EvaluationError
+
+    names = surrogate.record.ranges.names
+    if sorted(names) != sorted(reference.parameter_names):
+        raise EvaluationError(
+            f"{folder}: the model takes the parameters {', '.join(names)}; the dataset has "
+            f"{', '.join(reference.parameter_names) or 'none'}; give the dataset it was trained on"
+        )
+    if surrogate.graphs.n_nodes(0) != reference.n_nodes:
+        raise EvaluationError(
+            f"{folder}: the model was trained on a mesh of {surrogate.graphs.n_nodes(0)} nodes; the dataset has "
+            f"{reference.n_nodes}; give the dataset it was trained on"
+        )
+    order = tuple(reference.parameter_names.index(n) for n in names)
+    predictors = tuple(
+        StoredLevel(
+            surrogate, name, level, _own_mesh(surrogate, folder, name, level, reference), order,
+            n_parameters=surrogate.n_parameters(level),
+            n_latent=surrogate.n_latent(level),
+            seconds_per_epoch=surrogate.seconds_per_epoch(level),
+            training_seconds=surrogate.training_seconds(level),
+            history=surrogate.history(level),
+        )
+        for name, level in sorted(surrogate.level_names.items(), key=lambda item: item[1])
+    )  # fmt: skip
+    record = surrogate.record
+    configuration = surrogate.settings.model_dump(mode="json")
+    configuration.pop("seed", None)
+    return Model(
+        name=folder.resolve().name,
+        predictors=predictors,
+        fitted_runs=record.fitted_runs,
+        tuned_runs=record.validation_runs,
+        held_out_runs=record.held_out_runs,
+        checksum=record.checksum,
+        seed=record.seed,
+        configuration=configuration,
+    )
+
+
+def _own_mesh(surrogate: Surrogate, folder: Path, name: str, level: int, reference: Reference) -> Mesh | None:
+    """The level's own mesh where training refined it; None where it is the dataset's."""
+    import numpy as np
+
+    from evaluation.errors import EvaluationError
+
+    if level == 0 or np.array_equal(surrogate.graphs.kept(level), reference.level(level).kept):
+        return None
+    if surrogate.settings.refinement.adaptive:
+        return surrogate.graphs[level]
+    raise EvaluationError(
+        f"{folder}: {name} was trained on {surrogate.graphs.n_nodes(level)} other nodes than level {level} of the "
+        f"dataset has ({reference.level_nodes(level)}); the dataset was coarsened anew: train the model again"
+    )
+
+
+@contextlib.contextmanager
+def _counted(tell: Progress, what: str, total: int | None) -> Iterator[Callable[[int], None]]:
+    """Report one step after the other under the name `what`."""
+    count = 0
+
+    def step(_: int) -> None:
+        nonlocal count
+        count += 1
+        tell(what, count, total or 0)
+
+    tell(what, 0, total or 0)
+    yield step
+
+
+def _context(dataset: Path, reference: Reference, models: Sequence[Model], split: Any) -> dict[str, str]:
+    """The methods section: what was compared, on what, with what."""
+    import datetime
+    import platform
+    from importlib.metadata import PackageNotFoundError, version
+
+    packages = []
+    for name in ("crashkit", "torch", "scikit-learn", "numpy", "scipy", "xarray", "vtk", "pyvista"):
+        with contextlib.suppress(PackageNotFoundError):
+            packages.append(f"{name} {version(name)}")
+    names = [reference.runs[k] for k in split.test]
+    attributes = reference.attributes
+    return {
+        "Dataset": dataset.name,
+        "Checksum (SHA-256)": reference.checksum or "not recorded",
+        "Solver": attributes.get("solver", "not recorded"),
+        "Runs": f"{len(reference.runs)}, of which {len(names)} test",
+        "Test runs": ", ".join(names),
+        "Parameters": ", ".join(
+            f"{n} ({u})" for n, u in zip(reference.parameter_names, reference.parameter_units, strict=True)
+        )
+        or "none",
+        "States": f"{len(reference.time)} from {reference.time[0] * 1e3:.4g} to {reference.time[-1] * 1e3:.4g} ms",
+        "Meshes": ", ".join(f"{reference.level_nodes(k)} nodes (level {k})" for k in range(len(reference.levels) + 1)),
+        "Models": ", ".join(m.name for m in models),
+        "Versions": f"Python {platform.python_version()}, {', '.join(packages)}",
+        "Machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()}",
+        "Made": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
+    }
+
+
+def _processor() -> str:
+    """The processor's name as far as the system tells it."""
+    import platform
+
+    with contextlib.suppress(OSError), Path("/proc/cpuinfo").open(encoding="utf-8") as lines:
+        for line in lines:
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()

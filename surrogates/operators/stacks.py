@@ -1,0 +1,170 @@
+"""Encoder and decoder of a level: stacks of graph convolutions and one dense layer at the latent vector.
+
+On a CPU, stacks of Chebyshev convolutions run in compiled code (`surrogates.operators.compiled`) where it could be built. What
+follows is the same in torch, for everything else.
+
+How a level is assembled::
+
+    operator = GraphOperator(edges, n_nodes)                       # kind="cheb" | "gcn" | "gcn2"
+    encoder = GraphEncoder(operator, latent=4, channels=(3, 6, 12, 24), order=3)
+    decoder = GraphDecoder(operator, latent=4, channels=(24, 12, 6, 3), order=3)
+    z = encoder(x)                                                  # (n, b, 3) -> (b, 4)
+    both = decoder(torch.cat([z, mlp(inputs)]))                     # (2b, 4) -> (n, 2b, 3): one pass for both losses
+    reconstruction, approximation = both.chunk(2, dim=1)
+
+Source: Kneifl et al. 2024, section 3.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from surrogates.errors import SurrogateError
+from surrogates.operators import compiled
+from surrogates.operators.convolutions import ChebConv, GCN2Conv, GCNConv
+from surrogates.operators.graph import GraphOperator, check_state
+
+
+class _Encode(torch.autograd.Function):
+    """z = h^T W^T + b for h (m, batch), W (latent, m): -> (batch, latent).
+
+    Every product has the latent size in front: with it behind, the same product takes up to ten times as long.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, h: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        ctx.save_for_backward(h, weight)
+        return torch.addmm(bias[:, None], weight, h).t()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        h, weight = ctx.saved_tensors
+        gradient = gradients[0].t()
+        gradient_h = weight.t() @ gradient if ctx.needs_input_grad[0] else None
+        return gradient_h, gradient @ h.t(), gradient.sum(dim=1)
+
+
+class _Decode(torch.autograd.Function):
+    """h = ELU(W z^T + b) for z (batch, latent), W (m, latent): -> (m, batch), and its gradient as in `_Encode`."""
+
+    @staticmethod
+    def forward(ctx: Any, z: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        h = functional.elu(torch.addmm(bias[:, None], weight, z.t()), inplace=True)
+        ctx.save_for_backward(z, weight, h)
+        return h
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        z, weight, h = ctx.saved_tensors
+        gradient = torch.ops.aten.elu_backward(gradients[0], 1.0, 1.0, 1.0, True, h)
+        gradient_z = (weight.t() @ gradient).t() if ctx.needs_input_grad[0] else None
+        return gradient_z, (z.t() @ gradient.t()).t(), gradient.sum(dim=1)
+
+
+class Convolutions(nn.Module):
+    """The convolutions of one encoder or decoder: (node, batch, channels[0]) -> (node, batch, channels[-1]).
+
+    The operator's kind chooses the layer. ELU follows every layer; `linear_end` leaves it out after the last one.
+    "gcn2" needs one width throughout, so it works at the widest of `channels` between two linear maps at the nodes.
+    """
+
+    def __init__(self, operator: GraphOperator, channels: Sequence[int], order: int = 3, *, linear_end: bool) -> None:
+        super().__init__()
+        if len(channels) < 2:
+            raise SurrogateError(f"channels are {tuple(channels)}; at least an input and an output width are needed")
+        self.operator = operator
+        steps = list(pairwise(channels))
+        elu = [True] * (len(steps) - 1) + [not linear_end]
+        self.before: nn.Module = nn.Identity()
+        self.after: nn.Module = nn.Identity()
+        if operator.kind == "cheb":
+            layers: list[nn.Module] = [ChebConv(a, b, order, operator, elu=e) for (a, b), e in zip(steps, elu)]
+        elif operator.kind == "gcn":
+            layers = [GCNConv(a, b, operator, elu=e) for (a, b), e in zip(steps, elu)]
+        else:
+            width = max(channels)
+            if channels[0] != width:
+                self.before = nn.Linear(channels[0], width)
+            if channels[-1] != width:
+                self.after = nn.Linear(width, channels[-1])
+            layers = [GCN2Conv(width, operator, layer=i + 1, elu=True) for i in range(len(steps))]
+        self.layers = nn.ModuleList(layers)
+
+    def of_chebyshev(self) -> tuple[GraphOperator, list[Tensor], list[Tensor], list[bool]]:
+        """Operator, weights, biases and whether ELU follows, of a stack of Chebyshev convolutions."""
+        layers = [layer for layer in self.layers if isinstance(layer, ChebConv)]
+        biases = [
+            layer.weight.new_zeros(layer.weight.shape[2]) if layer.bias is None else layer.bias for layer in layers
+        ]
+        return self.operator, [layer.weight for layer in layers], biases, [layer.elu for layer in layers]
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = self.before(x)
+        x0 = x
+        for layer in self.layers:
+            x = layer(x, x0) if isinstance(layer, GCN2Conv) else layer(x)
+        return self.after(x)
+
+
+class GraphEncoder(nn.Module):
+    """Convolutions, then one dense linear layer: x (node, batch, channels[0]) -> z (batch, latent).
+
+    The dense layer's inputs are ordered node by node, channel by channel within a node.
+    Source: Kneifl et al. 2024, section 3.3 and table 1.
+    """
+
+    def __init__(
+        self, operator: GraphOperator, latent: int, channels: Sequence[int] = (3, 6, 12, 24), order: int = 3
+    ) -> None:
+        super().__init__()
+        self.channels = channels[0]
+        self.convolutions = Convolutions(operator, channels, order, linear_end=False)
+        self.dense = nn.Linear(operator.n_nodes * channels[-1], latent)
+
+    def forward(self, x: Tensor) -> Tensor:
+        operator = self.convolutions.operator
+        if compiled.usable(x, operator):
+            check_state(x, operator, self.channels)
+            return compiled.encode(x, *self.convolutions.of_chebyshev(), (self.dense.weight, self.dense.bias))
+        h = self.convolutions(x)
+        if operator.form == "dense":
+            return functional.linear(h.transpose(0, 1).flatten(1), self.dense.weight, self.dense.bias)
+        weight = self.dense.weight.unflatten(1, (operator.n_nodes, -1)).transpose(1, 2).flatten(1)
+        return _Encode.apply(h.permute(2, 0, 1).reshape(-1, h.shape[1]), weight, self.dense.bias)
+
+
+class GraphDecoder(nn.Module):
+    """One dense layer with ELU, then convolutions, the last linear: z (batch, latent) -> (node, batch, channels[-1]).
+
+    The dense layer's results are ordered as the encoder's inputs to its own.
+    Source: Kneifl et al. 2024, section 3.3 and table 1: the encoder in reverse order.
+    """
+
+    def __init__(
+        self, operator: GraphOperator, latent: int, channels: Sequence[int] = (24, 12, 6, 3), order: int = 3
+    ) -> None:
+        super().__init__()
+        self.n_nodes = operator.n_nodes
+        self.channels = channels[0]
+        self.dense = nn.Linear(latent, operator.n_nodes * channels[0])
+        self.convolutions = Convolutions(operator, channels, order, linear_end=True)
+
+    def forward(self, z: Tensor) -> Tensor:
+        operator, (weight, bias) = self.convolutions.operator, (self.dense.weight, self.dense.bias)
+        if compiled.usable(z, operator):
+            return compiled.decode(z, *self.convolutions.of_chebyshev(), (weight, bias))
+        if operator.form == "dense":
+            h = functional.elu(functional.linear(z, weight, bias))
+            return self.convolutions(h.unflatten(1, (self.n_nodes, self.channels)).transpose(0, 1))
+        weight = weight.unflatten(0, (self.n_nodes, self.channels)).transpose(0, 1).flatten(0, 1)
+        bias = bias.unflatten(0, (self.n_nodes, self.channels)).t().flatten()
+        h = _Decode.apply(z, weight, bias)
+        return self.convolutions(h.reshape(self.channels, self.n_nodes, -1).permute(1, 2, 0))

@@ -1,0 +1,117 @@
+"""What became of a training: runs, errors, choices, versions; kept in the model folder."""
+
+from __future__ import annotations
+
+import datetime
+import platform
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogates.data.campaign import Campaign
+from surrogates.data.inputs import Ranges
+from surrogates.data.samples import Split
+from surrogates.settings import Settings
+from surrogates.training.loop import Fit
+
+
+@dataclass
+class Record:
+    """Where a surrogate comes from and how its training went.
+
+    ranges      names, units and ranges of the parameters, and of the time, over the runs it was fitted to
+    time        (state,) s, the states it was trained on
+    fits        how each level's training went
+    errors      e2 (m) by what was measured, on validation runs, on the level's own nodes
+    choice      what a POD regression chose on the validation runs: inputs and modes
+    notes       what was unusual about the data
+    """
+
+    ranges: Ranges
+    time: NDArray[np.float64]
+    checksum: str
+    fitted_runs: tuple[str, ...]
+    validation_runs: tuple[str, ...]
+    held_out_runs: tuple[str, ...]
+    seed: int
+    created: str
+    versions: dict[str, str]
+    attributes: dict[str, str]
+    fits: dict[int, Fit] = field(default_factory=dict)
+    errors: dict[str, float] = field(default_factory=dict)
+    choice: dict[str, Any] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, campaign: Campaign, settings: Settings, ranges: Ranges, split: Split) -> Record:
+        names = campaign.runs or tuple(str(k) for k in range(len(campaign.parameters)))
+        return cls(
+            ranges=ranges,
+            time=np.asarray(campaign.time, np.float64),
+            checksum=campaign.checksum,
+            fitted_runs=tuple(names[k] for k in split.training),
+            validation_runs=tuple(names[k] for k in split.validation),
+            held_out_runs=campaign.held_out,
+            seed=settings.seed,
+            created=datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+            versions=_versions(),
+            attributes=dict(campaign.attributes or {}),
+        )
+
+
+def record_as_dict(record: Record) -> dict[str, Any]:
+    """Plain values for JSON, without the histories."""
+    ranges = record.ranges
+    out = asdict(record)
+    out["ranges"] = {
+        "names": list(ranges.names), "units": list(ranges.units), "low": ranges.low.tolist(),
+        "high": ranges.high.tolist(), "time": list(ranges.time),
+    }  # fmt: skip
+    out["time"] = record.time.tolist()
+    out["fits"] = {
+        str(k): {"best_epoch": f.best_epoch, "best": f.best, "seconds": f.seconds, "status": f.status}
+        for k, f in record.fits.items()
+    }
+    return out
+
+
+def record_from_dict(values: Mapping[str, Any], histories: Mapping[int, dict[str, list[float]]]) -> Record:
+    """The way back; raises KeyError or TypeError where something is missing."""
+    ranges = values["ranges"]
+    return Record(
+        ranges=Ranges(
+            tuple(ranges["names"]), tuple(ranges["units"]), np.array(ranges["low"], np.float64),
+            np.array(ranges["high"], np.float64), (float(ranges["time"][0]), float(ranges["time"][1])),
+        ),
+        time=np.array(values["time"], np.float64),
+        checksum=values["checksum"],
+        fitted_runs=tuple(values["fitted_runs"]),
+        validation_runs=tuple(values["validation_runs"]),
+        held_out_runs=tuple(values["held_out_runs"]),
+        seed=int(values["seed"]),
+        created=values["created"],
+        versions=dict(values["versions"]),
+        attributes=dict(values["attributes"]),
+        fits={
+            int(k): Fit(histories.get(int(k), {}), f["best_epoch"], f["best"], f["seconds"], f["status"])
+            for k, f in values["fits"].items()
+        },
+        errors=dict(values["errors"]),
+        choice=dict(values["choice"]),
+        notes=list(values["notes"]),
+    )  # fmt: skip
+
+
+def _versions() -> dict[str, str]:
+    from importlib.metadata import PackageNotFoundError, version
+
+    out = {"python": platform.python_version()}
+    for name in ("crashkit", "torch", "numpy", "scipy", "scikit-learn", "safetensors"):
+        try:
+            out[name] = version(name)
+        except PackageNotFoundError:
+            out[name] = "unknown"
+    return out
