@@ -257,7 +257,7 @@ def forgetful(monkeypatch):
 def test_a_figure_of_somebody_else_stands_in_the_report(campaign, small, forgetful, tmp_path, monkeypatch):
     out = tmp_path / "report"
     monkeypatch.setattr(sys, "argv", ["add_figure.py", *map(str, (campaign / "kart.zarr", out, campaign / "podnn"))])
-    script = Path(__file__).parents[2] / "examples" / "add_figure.py"
+    script = Path(__file__).parents[3] / "examples" / "add_figure.py"
     runpy.run_path(str(script), run_name="__main__")
     assert len(script.read_text(encoding="utf-8").splitlines()) < 60
     assert "Error over motion" in (out / "report.html").read_text(encoding="utf-8")

@@ -18,7 +18,7 @@ from surrogates.settings import settings
 from surrogates.storage.folder import load, save
 from surrogates.training.train import train
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "add_reduction.py"
+EXAMPLE = Path(__file__).parents[3] / "examples" / "add_reduction.py"
 SMALL = ("level.latent=3", "level.epochs=2", "levels=[2, 1]", "level.mlp.widths=[8]", "level.reduction=quadratic")
 
 

@@ -130,7 +130,7 @@ def test_where_nothing_can_be_rendered_the_rest_is_there(evaluation, tmp_path, m
 
 
 def test_every_file_in_the_folder_of_figures_that_is_a_figure_is_in_order():
-    folder = Path(__file__).parents[2] / "evaluation" / "figures"
+    folder = Path(__file__).parents[3] / "evaluation" / "figures"
     files = {p.stem for p in folder.glob("*.py") if "\nFIGURE = Kind(" in p.read_text(encoding="utf-8")}
     assert files == set(ORDER)
     assert [kind.name for kind in kinds()] == list(ORDER)
