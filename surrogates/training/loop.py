@@ -35,6 +35,11 @@ class Objective(nn.Module):
 
     size: int
 
+    @property
+    def scale(self) -> float:
+        """The unit of the states the losses are taken of, m."""
+        return 1.0
+
     def validation(self) -> Tensor | None:
         """Losses (2,) over the validation samples; None where there are none."""
         raise NotImplementedError
@@ -46,7 +51,14 @@ class Objective(nn.Module):
 
 @dataclass(frozen=True)
 class Epoch:
-    """What is told after each epoch. Losses are unweighted parts and their weighted total; `rate` is epochs a second."""
+    """Progress report of one epoch.
+
+    total, approximation, reconstruction, validation  losses: the weighted total, its unweighted parts, the total over
+                                                      the validation runs (NaN without any)
+    validation_error, best_error  root mean square distance of predicted and true nodes over the validation runs, m, in
+                                  this epoch and in the best one; NaN without validation runs
+    rate                          epochs per second
+    """
 
     name: str
     epoch: int
@@ -59,6 +71,8 @@ class Epoch:
     learning_rate: float
     rate: float
     seconds_left: float
+    validation_error: float = math.nan
+    best_error: float = math.nan
 
 
 @dataclass
@@ -137,7 +151,7 @@ def fit(
                 out.best, out.best_epoch = judged, epoch + 1
                 best = {k: v.detach().clone() for k, v in names.items()}
             if report is not None and plan.rank == 0:
-                report(_told(name, settings.epochs, out))
+                report(_told(name, settings.epochs, out, objective.scale))
             if keeper is not None and plan.rank == 0 and (keeper.due(epoch + 1) or epoch + 1 == settings.epochs):
                 keeper.save(name, _tensors(names, best, optimiser, trained), _about(out))
     except KeyboardInterrupt:
@@ -334,13 +348,16 @@ def _restore(
     return {k: tensors[f"best.{k}"].to(device) for k in names if f"best.{k}" in tensors}
 
 
-def _told(name: str, epochs: int, out: Fit) -> Epoch:
+def _told(name: str, epochs: int, out: Fit, scale: float) -> Epoch:
+    losses = out.history.get("validation_approximation", [math.nan] * out.epochs)
+    distance, best = (scale * math.sqrt(3.0 * loss) for loss in (losses[-1], losses[out.best_epoch - 1]))
     last = {key: values[-1] for key, values in out.history.items()}
     done = out.epochs
     return Epoch(
         name, done, epochs, last["total"], last["approximation"], last["reconstruction"],
         last.get("validation_total", math.nan),
         out.best_epoch, last["learning_rate"], done / out.seconds, out.seconds / done * (epochs - done),
+        distance, best,
     )  # fmt: skip
 
 

@@ -69,6 +69,10 @@ class LevelObjective(Objective):
         self.training_samples, self.validation_samples = training, validation
         self.size = len(training)
 
+    @property
+    def scale(self) -> float:
+        return self.level.scale
+
     def networks(self) -> dict[str, nn.Module]:
         return {"level": self.level}
 
@@ -118,6 +122,10 @@ class LatentObjective(Objective):
         # Modes are orthogonal, so a wrong latent number costs its mode's square and nothing mixes.
         self.weight = modes.decode_matrix.detach().square().sum(dim=0) / (3 * level.n_nodes)
 
+    @property
+    def scale(self) -> float:
+        return self.level.scale
+
     def networks(self) -> dict[str, nn.Module]:
         return {"level": self.level}
 
@@ -151,6 +159,10 @@ class UnifiedObjective(Objective):
         self.network = network
         self.training_samples, self.validation_samples = training, validation
         self.size = len(training)
+
+    @property
+    def scale(self) -> float:
+        return self.network.scale
 
     def networks(self) -> dict[str, nn.Module]:
         return {"levels": self.network}

@@ -15,6 +15,7 @@ from surrogates.errors import SurrogateError
 from surrogates.settings import LevelSettings, settings
 from surrogates.training.checkpoints import Checkpoints
 from surrogates.training.loop import Diverged, Epoch, Fit, Objective, device_of, fit, learning_rates
+from surrogates.training.train import train
 
 SETTINGS = LevelSettings(epochs=12, batch=8, learning_rate=0.05, schedule="one_cycle")
 
@@ -181,3 +182,17 @@ def test_a_constant_rate_is_constant() -> None:
 def test_a_device_that_is_not_there_is_refused() -> None:
     with pytest.raises(SurrogateError, match="device 'tpu' is not known; choose cpu, cuda, mps or auto"):
         device_of("tpu")
+
+
+@pytest.mark.parametrize("model", ["mh", "podnn"])
+def test_the_error_told_is_the_distance_of_validation_nodes_in_metres(model: str) -> None:
+    told: list[Epoch] = []
+    campaign = plate.campaign(10)
+    surrogate = train(campaign, settings(model, overrides=["level.epochs=1"]), report=told.append)
+    validation = [campaign.runs.index(name) for name in surrogate.record.validation_runs]
+    for epoch, number in zip(told, surrogate.level_names.values(), strict=True):
+        truth = campaign.displacement(number)[validation]
+        wrong = surrogate.predict(campaign.parameters[validation], campaign.time, number) - truth
+        expected = np.sqrt(np.square(wrong).sum(axis=-1).mean())
+        assert epoch.validation_error == pytest.approx(expected, rel=1e-3)
+        assert epoch.best_error == epoch.validation_error
