@@ -21,11 +21,9 @@ check: $(READY)
 	$(BIN)/lint-imports --no-cache
 
 # Installed again only when what is to be installed has changed.
-$(READY): pyproject.toml constraints.txt surrogates/_convolution.c
-	@echo "Making the environment in $(VENV), once: some minutes and no output."
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
-	touch $@
+$(READY): pyproject.toml constraints.txt tools/make_environment.py $(wildcard surrogates/*/*.c surrogates/*.c)
+	@$(PYTHON) tools/make_environment.py $(VENV)
+	@touch $@
 
 docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
