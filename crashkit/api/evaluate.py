@@ -60,6 +60,9 @@ def evaluate(
     ReadError and ModelFolderError where files are not what they should be, OutputError where `output` cannot be
     written.
     """
+    from crashkit.extras import need
+
+    need("evaluating models", "train", "report")
     from crashkit.output import complete_folder
     from evaluation.comparison.result import compare, decompose
     from evaluation.comparison.sensors import choose_sensors

@@ -22,6 +22,9 @@ SUFFIXES = (".pvd", ".vtkhdf", ".vtu", ".vtp", ".npz")
 
 def load_model(folder: str | Path) -> Surrogate:
     """The model stored in `folder`; raises ModelFolderError if it is none, was altered or does not fit."""
+    from crashkit.extras import need
+
+    need("loading a model", "train")
     from surrogates.storage.folder import load
 
     return load(Path(folder))

@@ -50,6 +50,9 @@ def train(
     Raises SurrogateError for settings and data that do not fit, DataError and ReadError for the dataset, OutputError
     where `output` cannot be written, Diverged where a loss is not finite: then the last good weights are stored.
     """
+    from crashkit.extras import need
+
+    need("training a model", "train")
     from crashkit.api.campaign import open_campaign
     from surrogates.errors import SurrogateError
     from surrogates.settings import settings
@@ -169,14 +172,11 @@ def _tensorboard(folder: str | Path | None) -> Iterator[Callable[[Epoch], None]]
     if folder is None:
         yield lambda epoch: None
         return
-    from crashkit.errors import CrashkitError
+    from crashkit.extras import need
 
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise CrashkitError(
-            "TensorBoard files need the package tensorboard; pip install 'crashkit[tracking]'"
-        ) from error
+    need("writing TensorBoard files", "tracking")
+    from torch.utils.tensorboard import SummaryWriter
+
     writer = SummaryWriter(str(folder))
 
     def note(epoch: Epoch) -> None:

@@ -35,6 +35,7 @@ def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> Any:
         from crashkit.errors import CrashkitError
+        from crashkit.extras import explained
         from evaluation.errors import EvaluationError
         from surrogates.errors import SurrogateError
 
@@ -44,6 +45,10 @@ def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
             fail(str(error))
         except OSError as error:
             fail(f"{error.filename or 'file'}: {error.strerror or error}")
+        except ImportError as error:
+            if (line := explained(error)) is None:
+                raise
+            fail(line)
         except KeyboardInterrupt:
             fail("interrupted", code=130)
 

@@ -36,8 +36,11 @@ def command(
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Select the nodes of ever coarser meshes and store them in the dataset, with the maps between them."""
+    from crashkit.extras import need
     from crashkit.mesh.store import open_mesh, summarize_hierarchy
 
+    if picture is not None:
+        need("--picture", "report")
     if selection not in ("quadric", "vtk"):
         raise typer.BadParameter(f"{selection!r}; expected quadric or vtk", param_hint="--selection")
     counts = [int(n) for n in _numbers(nodes, "--nodes", "1165,292,73", whole=True)]

@@ -18,6 +18,9 @@ def command(
     json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Write one level as ONNX or torch.export file, and check that it predicts the same."""
+    from crashkit.extras import need
+
+    need("exporting a model", "train")
     from surrogates.storage.export import export
     from surrogates.storage.folder import load
 

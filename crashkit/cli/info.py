@@ -119,10 +119,12 @@ def command(
 ) -> None:
     """Print runs, states, time span, mesh, parts, parameters, largest displacement, size, and the mesh hierarchy."""
     from crashkit.dataset import open_dataset, reading
+    from crashkit.extras import need
 
     with open_dataset(path, chunks=None) as dataset, reading(path):
         found = describe(dataset, path)
         if report is not None:
+            need("a data card (--report)", "report")
             from evaluation.report.datacard import write_card
 
             with progress() as bar:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from crashkit.errors import DataError, ReadError
+from crashkit.extras import need
 
 _HEADER = re.compile(r"\s*(?P<name>[^\[(]+?)\s*(?:[\[(](?P<unit>[^\])]*)[\])])?\s*")
 _KEYS = ("run", "sim", "name")
@@ -100,6 +101,7 @@ def _sheet_rows(path: Path) -> list[list[Any]]:
     import pandas as pd
 
     if path.suffix.lower() == ".xlsx":
+        need(f"reading {path}", "formats")
         frame = pd.read_excel(path, header=None, dtype=object)
     else:
         options: dict[str, Any] = {"header": None, "dtype": str, "skipinitialspace": True, "encoding": "utf-8-sig"}

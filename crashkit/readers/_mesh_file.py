@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
+from crashkit.extras import need
 
 # Rounding in files of few digits changes edge lengths by less than this.
 _EDGE_TOLERANCE = 0.02
@@ -45,12 +46,13 @@ def faces_of(path: Path, position: NDArray[np.floating]) -> NDArray[np.int32]:
 
 def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """Points (node, 3) and faces (face, 3 or 4), -1 in the last corner of a triangle among quadrilaterals."""
-    import meshio
-
     if not path.is_file():
         raise ReadError(f"{path}: no such mesh file")
     if path.suffix.lower() in (".vtp", ".vtu", ".vtk"):
         return _read_vtk(path)
+    need(f"reading {path}", "formats")
+    import meshio
+
     try:
         mesh = meshio.read(path)
     except Exception as error:  # meshio's formats raise whatever their parsers meet

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.errors import CrashkitError, ReadError
+from crashkit.extras import need
 from crashkit.readers import register
 from crashkit.readers._checks import reading, require_options
 from crashkit.readers._folders import runs_in
@@ -135,6 +136,7 @@ class _Xdmf(WholeStates):
     """The states of an XDMF file, through meshio."""
 
     def __init__(self, file: Path) -> None:
+        need(f"reading {file}", "formats")
         from meshio.xdmf import TimeSeriesReader
 
         self.file = file
@@ -188,9 +190,10 @@ class _Files(WholeStates):
         return f"{self.files[state]}, state {state}"
 
     def read(self, state: int) -> Grid:
+        file = self.files[state]
+        need(f"reading {file}", "formats")
         import meshio
 
-        file = self.files[state]
         try:
             mesh = meshio.read(file)
         except (Exception, SystemExit) as error:  # meshio leaves the program over a format it does not know
