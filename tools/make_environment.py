@@ -49,8 +49,8 @@ def explain(line: str, before: str) -> str:
         return f"looking up {found[1]}"
     if line.startswith("Installing collected packages:"):
         return f"installing {line.count(',') + 1} packages"
-    if found := re.match(r"\s*(?:Building|Preparing|Getting requirements).*?(?: for (.*))?$", line):
-        return f"building {found[1] or 'crashkit'}"
+    if found := re.match(r"\s*(?:Building|Preparing) .* for ([A-Za-z0-9_.-]+)", line):
+        return f"building {found[1]}"
     return before
 
 
