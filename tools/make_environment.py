@@ -7,10 +7,12 @@ the environment's folder.
 
 from __future__ import annotations
 
+import os
 import queue
 import re
 import subprocess
 import sys
+import sysconfig
 import threading
 import time
 from pathlib import Path
@@ -54,6 +56,15 @@ def explain(line: str, before: str) -> str:
     return before
 
 
+def installed(folder: Path) -> int:
+    """How many packages the environment has so far."""
+    paths = {"base": str(folder), "platbase": str(folder)}
+    try:
+        return sum(name.endswith(".dist-info") for name in os.listdir(sysconfig.get_path("purelib", "venv", paths)))
+    except OSError:
+        return 0
+
+
 def run(command: list[str], folder: Path, log: Path, display: Display) -> None:
     """Run a command; its lines go to the log, and a status line appears every few seconds."""
     lines: queue.Queue[str | None] = queue.Queue()
@@ -77,8 +88,7 @@ def run(command: list[str], folder: Path, log: Path, display: Display) -> None:
                 break
             file.write(line)
             doing = explain(line, doing)
-            there = len(list(folder.glob("[Ll]ib*/**/site-packages/*.dist-info"))) if "installing" in doing else 0
-            display.status(doing + (f", {there} there" if there else ""))
+            display.status(doing + (f", {installed(folder)} there" if doing.startswith("installing") else ""))
     if process.wait():
         tail = "".join(log.read_text(encoding="utf-8").splitlines(keepends=True)[-25:])
         sys.exit(f"\n{tail}\nThe environment could not be made; the lines above say why, {log} has all of them.")
