@@ -7,7 +7,6 @@ the environment's folder.
 
 from __future__ import annotations
 
-import os
 import queue
 import re
 import subprocess
@@ -58,9 +57,9 @@ def explain(line: str, before: str) -> str:
 
 def installed(folder: Path) -> int:
     """How many packages the environment has so far."""
-    paths = {"base": str(folder), "platbase": str(folder)}
+    packages = Path(sysconfig.get_path("purelib", "venv", {"base": str(folder), "platbase": str(folder)}))
     try:
-        return sum(name.endswith(".dist-info") for name in os.listdir(sysconfig.get_path("purelib", "venv", paths)))
+        return sum(entry.name.endswith(".dist-info") for entry in packages.iterdir())
     except OSError:
         return 0
 
