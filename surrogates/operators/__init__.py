@@ -1,1 +1,1 @@
-"""Graph operators, convolutions, upsampling, and the compiled path."""
+"""Graph operators, convolutions and upsampling."""

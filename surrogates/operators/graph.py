@@ -57,7 +57,6 @@ class GraphOperator:
         self.matrix: sparse.csr_matrix = sparse.csr_matrix(matrix)
         self.matrix.sort_indices()
         self._tensors: dict[tuple[torch.device, torch.dtype, int], Tensor] = {}
-        self.compiled: dict[torch.dtype, Any] = {}  # what `surrogates.operators.compiled` made of it
 
     def dense_form(self) -> GraphOperator:
         """The same operator held as a dense matrix (n, n), as torch.export and ONNX need it."""

@@ -1,8 +1,5 @@
 """Encoder and decoder of a level: stacks of graph convolutions and one dense layer at the latent vector.
 
-On a CPU, stacks of Chebyshev convolutions run in compiled code (`surrogates.operators.compiled`) where it could be built. What
-follows is the same in torch, for everything else.
-
 How a level is assembled::
 
     operator = GraphOperator(edges, n_nodes)                       # kind="cheb" | "gcn" | "gcn2"
@@ -26,9 +23,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from surrogates.errors import SurrogateError
-from surrogates.operators import compiled
 from surrogates.operators.convolutions import ChebConv, GCN2Conv, GCNConv
-from surrogates.operators.graph import GraphOperator, check_state
+from surrogates.operators.graph import GraphOperator
 
 
 class _Encode(torch.autograd.Function):
@@ -98,14 +94,6 @@ class Convolutions(nn.Module):
             layers = [GCN2Conv(width, operator, layer=i + 1, elu=True) for i in range(len(steps))]
         self.layers = nn.ModuleList(layers)
 
-    def of_chebyshev(self) -> tuple[GraphOperator, list[Tensor], list[Tensor], list[bool]]:
-        """Operator, weights, biases and whether ELU follows, of a stack of Chebyshev convolutions."""
-        layers = [layer for layer in self.layers if isinstance(layer, ChebConv)]
-        biases = [
-            layer.weight.new_zeros(layer.weight.shape[2]) if layer.bias is None else layer.bias for layer in layers
-        ]
-        return self.operator, [layer.weight for layer in layers], biases, [layer.elu for layer in layers]
-
     def forward(self, x: Tensor) -> Tensor:
         x = self.before(x)
         x0 = x
@@ -125,15 +113,11 @@ class GraphEncoder(nn.Module):
         self, operator: GraphOperator, latent: int, channels: Sequence[int] = (3, 6, 12, 24), order: int = 3
     ) -> None:
         super().__init__()
-        self.channels = channels[0]
         self.convolutions = Convolutions(operator, channels, order, linear_end=False)
         self.dense = nn.Linear(operator.n_nodes * channels[-1], latent)
 
     def forward(self, x: Tensor) -> Tensor:
         operator = self.convolutions.operator
-        if compiled.usable(x, operator):
-            check_state(x, operator, self.channels)
-            return compiled.encode(x, *self.convolutions.of_chebyshev(), (self.dense.weight, self.dense.bias))
         h = self.convolutions(x)
         if operator.form == "dense":
             return functional.linear(h.transpose(0, 1).flatten(1), self.dense.weight, self.dense.bias)
@@ -159,12 +143,12 @@ class GraphDecoder(nn.Module):
 
     def forward(self, z: Tensor) -> Tensor:
         operator, (weight, bias) = self.convolutions.operator, (self.dense.weight, self.dense.bias)
-        if compiled.usable(z, operator):
-            return compiled.decode(z, *self.convolutions.of_chebyshev(), (weight, bias))
         if operator.form == "dense":
             h = functional.elu(functional.linear(z, weight, bias))
             return self.convolutions(h.unflatten(1, (self.n_nodes, self.channels)).transpose(0, 1))
         weight = weight.unflatten(0, (self.n_nodes, self.channels)).transpose(0, 1).flatten(0, 1)
         bias = bias.unflatten(0, (self.n_nodes, self.channels)).t().flatten()
         h = _Decode.apply(z, weight, bias)
-        return self.convolutions(h.reshape(self.channels, self.n_nodes, -1).permute(1, 2, 0))
+        x = self.convolutions(h.reshape(self.channels, self.n_nodes, -1).permute(1, 2, 0))
+        # Gradients want the memory channel by channel; in a prediction, node by node, what follows moves whole rows.
+        return x if torch.is_grad_enabled() else x.transpose(1, 2).contiguous().transpose(1, 2)
