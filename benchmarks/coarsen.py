@@ -42,7 +42,8 @@ from crashkit.mesh.hierarchy import build_hierarchy
 from crashkit.mesh.levels import Hierarchy
 from crashkit.mesh.lifting import LiftingMeter
 from crashkit.mesh.selection import select_quadric
-from crashkit.mesh.surface import Surface, face_edges, surface
+from crashkit.mesh.surface import Surface, surface
+from data_schema.edges import face_edges
 
 # Lifting errors, cm, that the full kart campaign of 4600 nodes shall stay below, by nodes kept.
 LIFTING_GOAL = {1165: 0.045, 292: 0.15, 73: 0.33}

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from crashkit.errors import DataError
 from data_schema import fields, parameters
+from data_schema.edges import face_edges
 
 if TYPE_CHECKING:
     import pyvista
@@ -73,8 +74,6 @@ class CrashAccessor:
 
     def edges(self) -> NDArray[np.int32]:
         """(e, 2) sides of the faces, each once, i < j."""
-        from crashkit.mesh.surface import face_edges
-
         return face_edges(self._dataset["face_nodes"].values)
 
     def surface(self, sim: int | str | None = None) -> pyvista.PolyData:

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from xarray.backends import BackendArray, BackendEntrypoint
 from xarray.core import indexing
 
-from crashkit import __version__
 from crashkit.dataset import open_dataset
 from crashkit.errors import DataError, ReadError
 from crashkit.ingestion.run_view import RunView, gone_nodes
@@ -29,6 +28,7 @@ from crashkit.ingestion.structure import structure_of
 from crashkit.ingestion.survey import reader_options, wanted_field
 from crashkit.readers import reader_for
 from crashkit.readers.base import Run, Runs
+from crashkit.version import __version__
 from data_schema import CONVENTIONS, to_si, unit_system
 
 

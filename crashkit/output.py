@@ -1,8 +1,9 @@
-"""Folders that appear under their name when everything in them is complete, and never half-written."""
+"""Folders that appear under their name when everything in them is complete, and never half-written; names of results."""
 
 from __future__ import annotations
 
 import contextlib
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -44,3 +45,8 @@ def complete_folder(output: Path, mark: str) -> Iterator[Path]:
         ) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def file_name(name: str) -> str:
+    """`name` with everything that is troublesome in file names replaced by a dash."""
+    return re.sub(r"[^A-Za-z0-9_.+=-]+", "-", name).strip("-.") or "run"

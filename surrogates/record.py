@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import datetime
+import math
 import platform
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,30 @@ from surrogates.data.campaign import Campaign
 from surrogates.data.inputs import Ranges
 from surrogates.data.samples import Split
 from surrogates.settings import Settings
-from surrogates.training.loop import Fit
+
+HISTORY = (
+    "total", "approximation", "reconstruction",
+    "validation_total", "validation_approximation", "validation_reconstruction",
+)  # fmt: skip
+
+
+@dataclass
+class Fit:
+    """How a training went. `best_epoch` counts from 1; `history` has one value an epoch: HISTORY and learning_rate."""
+
+    history: dict[str, list[float]] = field(default_factory=dict)
+    best_epoch: int = 0
+    best: float = math.inf
+    seconds: float = 0.0
+    status: Literal["finished", "interrupted", "diverged"] = "finished"
+
+    @property
+    def epochs(self) -> int:
+        return len(self.history.get("total", ()))
+
+    @property
+    def seconds_per_epoch(self) -> float:
+        return self.seconds / self.epochs if self.epochs else math.nan
 
 
 @dataclass

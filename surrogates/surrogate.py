@@ -15,9 +15,8 @@ from surrogates.errors import SurrogateError
 from surrogates.models.base import Network
 from surrogates.models.pod_regression import PodRegression
 from surrogates.operators.convolutions import exportable
-from surrogates.record import Record
+from surrogates.record import Fit, Record
 from surrogates.settings import Settings
-from surrogates.training.loop import Fit
 from surrogates.uncertainty import Band
 
 # Samples predicted at once.

@@ -61,7 +61,7 @@ for _name in COMMANDS:
 
 def _version(value: bool) -> None:
     if value:
-        from crashkit import __version__
+        from crashkit.version import __version__
 
         typer.echo(f"crashkit {__version__}")
         raise typer.Exit

@@ -13,8 +13,8 @@ from typing import Annotated
 
 import typer
 
-from crashkit import __version__
 from crashkit.cli._console import fail, say, table
+from crashkit.version import __version__
 
 # As in the kart data's README: the first 27 of 36 runs train, the last 9 test.
 TEST_RUNS = "27:36"

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crashkit import __version__
 from crashkit.errors import OutputError, ReadError
 from crashkit.ingestion import store
 from crashkit.ingestion.alignment import same_time
@@ -21,6 +20,7 @@ from crashkit.ingestion.structure import Structure
 from crashkit.ingestion.survey import Found
 from crashkit.ingestion.transfer import Layout
 from crashkit.readers.base import Part
+from crashkit.version import __version__
 from data_schema import CONVENTIONS, dataset_checksum, digests_of_run, parameters, run_checksum, validate
 from data_schema import fields as fields_of
 

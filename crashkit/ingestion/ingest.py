@@ -19,7 +19,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from crashkit import __version__
 from crashkit.errors import CrashkitError, DataError, OutputError, ReadError
 from crashkit.ingestion.alignment import common_time, reach, same_time
 from crashkit.ingestion.assembly import Existing, publish
@@ -28,6 +27,7 @@ from crashkit.ingestion.store import check_output, recover
 from crashkit.ingestion.structure import Structure
 from crashkit.ingestion.survey import Choice, Found, Survey, described, reader_options, survey
 from crashkit.ingestion.transfer import Layout, is_whole, let_memory_go, transfer
+from crashkit.version import __version__
 
 Progress = Callable[[int, int, str], None]
 

@@ -14,7 +14,6 @@ _LAZY = {
     "Level": "levels",
     "Surface": "surface",
     "build_hierarchy": "hierarchy",
-    "face_edges": "surface",
     "level_displacement": "store",
     "lift": "lifting",
     "read_hierarchy": "store",

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from crashkit.mesh.surface import adjacency
+from data_schema.edges import adjacency
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ from crashkit.errors import MeshError
 from crashkit.mesh.hierarchy import assemble
 from crashkit.mesh.levels import Hierarchy, Level
 from crashkit.mesh.selection import Selection, contract_onto, everything
-from crashkit.mesh.surface import Surface, adjacency, part_sets
+from crashkit.mesh.surface import Surface, part_sets
+from data_schema.edges import adjacency
 
 
 def refine(

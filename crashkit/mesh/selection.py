@@ -17,7 +17,8 @@ from scipy.spatial import cKDTree
 
 from crashkit.errors import MeshError
 from crashkit.mesh.quadric import vertex_quadrics
-from crashkit.mesh.surface import Surface, adjacency, unique_pairs
+from crashkit.mesh.surface import Surface
+from data_schema.edges import adjacency, unique_pairs
 
 if TYPE_CHECKING:
     from crashkit.mesh import _relocation

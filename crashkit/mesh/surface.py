@@ -11,9 +11,9 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import sparse
 
 from crashkit.errors import MeshError
+from data_schema.edges import face_edges, unique_pairs
 
 
 @dataclass(frozen=True)
@@ -103,27 +103,6 @@ def surface(
     return Surface(at, triangles, triangle_part, edges, used)
 
 
-def face_edges(face_nodes: ArrayLike) -> NDArray[np.int32]:
-    """Sides of (m, 3 or 4) faces as (e, 2) int32 pairs i < j, sorted, each once; -1 corners and loops left out."""
-    corners = np.asarray(face_nodes, dtype=np.int64)
-    last = corners[:, -1]
-    if corners.shape[1] == 4:
-        last = np.where(last < 0, corners[:, 2], last)
-    columns = [*corners.T[:-1], last]
-    pairs = np.concatenate([np.stack(side, axis=1) for side in zip(columns, [*columns[1:], columns[0]])])
-    return unique_pairs(pairs)
-
-
-def unique_pairs(pairs: NDArray[np.integer]) -> NDArray[np.int32]:
-    """Undirected pairs (e, 2) as int32 i < j, sorted, each once, without loops."""
-    low, high = pairs.min(axis=1).astype(np.int64), pairs.max(axis=1).astype(np.int64)
-    low, high = low[low != high], high[low != high]
-    width = int(high.max(initial=0)) + 1
-    keys = np.sort(low * width + high)
-    keys = keys[np.diff(keys, prepend=-1) > 0]  # np.unique hashes, which is slower here
-    return np.stack([keys // width, keys % width], axis=1).astype(np.int32)
-
-
 def part_sets(n: int, triangles: NDArray[np.int32], part: NDArray[np.int32], n_parts: int) -> NDArray[np.uint64]:
     """(n, words) uint64: bit p of a row is set where a triangle of part p touches the node."""
     sets = np.zeros((n, max(1, -(-n_parts // 64))), np.uint64)
@@ -131,13 +110,6 @@ def part_sets(n: int, triangles: NDArray[np.int32], part: NDArray[np.int32], n_p
     parts = np.repeat(part, 3)
     np.bitwise_or.at(sets, (rows, parts // 64), np.uint64(1) << (parts % 64).astype(np.uint64))
     return sets
-
-
-def adjacency(n: int, edges: NDArray[np.integer]) -> sparse.csr_matrix:
-    """Symmetric 0/1 matrix (n, n) of undirected edges (e, 2)."""
-    i, j = edges.T
-    ones = np.ones(2 * len(edges))
-    return sparse.csr_matrix((ones, (np.concatenate([i, j]), np.concatenate([j, i]))), shape=(n, n))
 
 
 def _triangulate(at: NDArray, corners: NDArray, part: NDArray) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

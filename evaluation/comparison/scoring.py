@@ -329,3 +329,16 @@ def gather(runs: Iterable[RunScores], keys: Sequence[Key]) -> Scores:
         probes=np.array([[s.watched.probes for s in row if s.watched] for row in table]),
         intrusion=np.array([[s.watched.intrusion for s in row if s.watched] for row in table]),
     )  # fmt: skip
+
+
+def contributions(lifted: Mapping[str, NDArray[np.floating]]) -> dict[str, NDArray[np.floating]]:
+    """What each level adds to the coarser one (paper, section 4.2): fields on the full mesh, coarsest first.
+
+    lifted  predictor -> field of any one shape, coarsest level first. The sum of all is the finest prediction.
+    """
+    out: dict[str, NDArray[np.floating]] = {}
+    before: NDArray[np.floating] | None = None
+    for name, field in lifted.items():
+        out[name] = field if before is None else field - before
+        before = field
+    return out

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evaluation.drawing.rendering import Image, choose_view, render
+from evaluation.drawing.style import CM, INK, MS, Sheet, look
 from evaluation.errors import EvaluationError
-from evaluation.figures.style import CM, INK, MS, Sheet, look
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

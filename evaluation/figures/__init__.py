@@ -15,9 +15,9 @@ from collections.abc import Iterator, Sequence
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING
 
+from evaluation.drawing.style import Sheet, styles
 from evaluation.errors import EvaluationError
 from evaluation.figures.kind import Drawing, Kind
-from evaluation.figures.style import Sheet, styles
 
 if TYPE_CHECKING:
     from evaluation.comparison.result import Evaluation

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from evaluation.drawing.style import CM, INK, Sheet, few_log_ticks, short
 from evaluation.figures.kind import Columns, Kind
-from evaluation.figures.style import CM, INK, Sheet, few_log_ticks, short
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from evaluation.comparison.scoring import contributions
+from evaluation.drawing.style import CM, MS, Sheet, called
 from evaluation.figures.kind import Columns, Kind
-from evaluation.figures.style import CM, MS, Sheet, called
-from evaluation.report.files import contributions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

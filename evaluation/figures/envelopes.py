@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from evaluation.drawing.style import CM, MS, Sheet
 from evaluation.figures.kind import Columns
-from evaluation.figures.style import CM, MS, Sheet
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

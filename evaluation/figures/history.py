@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from evaluation.drawing.style import Sheet, smoothed
 from evaluation.figures.kind import Columns, Kind
-from evaluation.figures.style import Sheet, smoothed
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from evaluation.drawing.style import Sheet, look
 from evaluation.errors import EvaluationError
-from evaluation.figures.style import Sheet, look
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.mesh.levels import Level
+from evaluation.drawing.style import CM, Sheet
 from evaluation.figures.kind import Columns, Kind
-from evaluation.figures.style import CM, Sheet
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from evaluation.drawing.style import CM, FAINT, INK, Sheet
 from evaluation.figures.kind import Columns
-from evaluation.figures.style import CM, FAINT, INK, Sheet
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from evaluation.drawing.style import Sheet
 from evaluation.figures.kind import Columns, Kind
-from evaluation.figures.style import Sheet
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -53,8 +53,8 @@ class FromFile:
 
 
 def select(evaluation: Evaluation) -> FromFile | None:
+    from crashkit.output import file_name
     from evaluation.drawing.rendering import rendering_problem
-    from evaluation.report.files import file_name
 
     best = evaluation.ranked[0]
     ending = file_name(evaluation.model(best).name)

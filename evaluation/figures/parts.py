@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from evaluation.drawing.style import CM, INK, Sheet
 from evaluation.figures.kind import Columns, Kind
-from evaluation.figures.style import CM, INK, Sheet
 from evaluation.measures.distance import masked_mean
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from evaluation.drawing.style import INK, MS, Sheet, called, leading
 from evaluation.figures.kind import Columns, Kind
-from evaluation.figures.style import INK, MS, Sheet, called, leading
 from evaluation.measures.curves import Curve, curves, shown, unit
 
 if TYPE_CHECKING:

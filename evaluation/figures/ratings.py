@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from evaluation.drawing.style import FAINT, Sheet
 from evaluation.figures.kind import Columns, Kind
-from evaluation.figures.style import FAINT, Sheet
 from evaluation.measures.curves import grade
 from evaluation.measures.distance import masked_mean
 from evaluation.measures.probes import GRADES

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from evaluation.drawing.style import INK, Sheet
 from evaluation.figures.kind import Columns, Kind
-from evaluation.figures.style import INK, Sheet
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

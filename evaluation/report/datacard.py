@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 
 from crashkit.output import complete_folder
 from evaluation.comparison.reference import Reference, reference_of
+from evaluation.drawing.style import CM, MS, Sheet, readable
 from evaluation.errors import EvaluationError
 from evaluation.figures.coverage import Coverage
 from evaluation.figures.envelopes import Envelopes
 from evaluation.figures.kind import Drawing, Kind, to_csv
 from evaluation.figures.outliers import Outliers, robust_score
 from evaluation.figures.singular_values import SingularValues
-from evaluation.figures.style import CM, MS, Sheet, readable
 from evaluation.measures.distance import gone, largest_node_error, mean_node_error, node_distance
 from evaluation.measures.pod import Pod, StreamedPod
 from evaluation.report.page import Page, plain_json, render_page, show_figure, show_table

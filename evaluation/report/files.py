@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,11 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from crashkit.output import file_name
 from crashkit.writers.paraview import write_paraview
 from evaluation.comparison.predictor import Model, Predictor
 from evaluation.comparison.reference import Reference
 from evaluation.comparison.result import Evaluation
-from evaluation.comparison.scoring import full_field, mesh_of
+from evaluation.comparison.scoring import contributions, full_field, mesh_of
 
 # Bytes of one predicted field held at once; several of them are.
 _BUDGET = 64 << 20
@@ -50,24 +50,6 @@ def write_run(evaluation: Evaluation, run: int, folder: Path) -> list[Path]:
                 name = file_name(f"{reference.runs[run]}_{model.name}_level{predictor.level}")
                 written += _write_coarse(reference, predictor, run, truth, folder / name)
     return written
-
-
-def file_name(name: str) -> str:
-    """`name` with everything that is troublesome in file names replaced by a dash."""
-    return re.sub(r"[^A-Za-z0-9_.+=-]+", "-", name).strip("-.") or "run"
-
-
-def contributions(lifted: Mapping[str, NDArray[np.floating]]) -> dict[str, NDArray[np.floating]]:
-    """What each level adds to the coarser one (paper, section 4.2): fields on the full mesh, coarsest first.
-
-    lifted  predictor -> field of any one shape, coarsest level first. The sum of all is the finest prediction.
-    """
-    out: dict[str, NDArray[np.floating]] = {}
-    before: NDArray[np.floating] | None = None
-    for name, field in lifted.items():
-        out[name] = field if before is None else field - before
-        before = field
-    return out
 
 
 def coarsest_level(reference: Reference) -> NDArray[np.int8]:

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from evaluation.drawing.style import Sheet, readable, span
 from evaluation.figures.kind import Drawing, Kind, drawn, image, write
-from evaluation.figures.style import Sheet, readable, span
 from evaluation.report.verdict import Statement
 
 PHONE_WIDTH = 9.0  # cm
@@ -83,7 +83,7 @@ def render_page(page: Page) -> str:
     """The page as HTML; everything it needs is inside it, and whatever is shown is escaped."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    from crashkit import __version__
+    from crashkit.version import __version__
 
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent / "templates"),

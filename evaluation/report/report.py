@@ -11,10 +11,10 @@ import numpy as np
 
 from evaluation.comparison.predictor import Model
 from evaluation.comparison.result import Evaluation
+from evaluation.drawing.style import CM, called
 from evaluation.errors import EvaluationError
 from evaluation.figures import drawings, sheet_of
 from evaluation.figures.kind import Columns, to_csv
-from evaluation.figures.style import CM, called
 from evaluation.measures.curves import rating_table
 from evaluation.report import tables
 from evaluation.report.page import (

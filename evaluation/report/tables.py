@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from evaluation.comparison.result import Evaluation
-from evaluation.figures.style import CM, MS
+from evaluation.drawing.style import CM, MS
 from evaluation.measures.distance import masked_mean
 
 

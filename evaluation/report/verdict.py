@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from evaluation.comparison.result import Evaluation
 from evaluation.comparison.split import Entry
-from evaluation.figures.style import CM, called
+from evaluation.drawing.style import CM, called
 from evaluation.measures.distance import masked_mean
 
 FEW_RUNS = 10  # fewer test runs than this carry no reliable ranking of close models

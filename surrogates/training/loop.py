@@ -10,8 +10,8 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
@@ -19,12 +19,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from surrogates.errors import SurrogateError
+from surrogates.record import HISTORY, Fit
 from surrogates.settings import LevelSettings
 
-HISTORY = (
-    "total", "approximation", "reconstruction",
-    "validation_total", "validation_approximation", "validation_reconstruction",
-)  # fmt: skip
+if TYPE_CHECKING:
+    from surrogates.surrogate import Surrogate
 
 
 class Objective(nn.Module):
@@ -73,25 +72,6 @@ class Epoch:
     seconds_left: float
     validation_error: float = math.nan
     best_error: float = math.nan
-
-
-@dataclass
-class Fit:
-    """How a training went. `best_epoch` counts from 1; `history` has one value an epoch: HISTORY and learning_rate."""
-
-    history: dict[str, list[float]] = field(default_factory=dict)
-    best_epoch: int = 0
-    best: float = math.inf
-    seconds: float = 0.0
-    status: Literal["finished", "interrupted", "diverged"] = "finished"
-
-    @property
-    def epochs(self) -> int:
-        return len(self.history.get("total", ()))
-
-    @property
-    def seconds_per_epoch(self) -> float:
-        return self.seconds / self.epochs if self.epochs else math.nan
 
 
 class Keeper(Protocol):
@@ -378,4 +358,4 @@ class Diverged(SurrogateError):
     """
 
     fit: Fit | None = None
-    surrogate: Any = None  # a surrogates.surrogate.Surrogate, which is built on this module
+    surrogate: Surrogate | None = None

@@ -16,10 +16,10 @@ from surrogates.errors import SurrogateError
 from surrogates.models.cascade import Cascade
 from surrogates.models.pod_regression import fit_pod_regression
 from surrogates.models.unified import Unified
-from surrogates.record import Record
+from surrogates.record import Fit, Record
 from surrogates.settings import Settings
 from surrogates.surrogate import Surrogate
-from surrogates.training.loop import Diverged, Epoch, Fit, Keeper, device_of
+from surrogates.training.loop import Diverged, Epoch, Keeper, device_of
 from surrogates.training.refinement import Refined
 from surrogates.training.trainer import Trainer
 from surrogates.uncertainty import FEWEST_RUNS, calibrate

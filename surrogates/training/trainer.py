@@ -17,11 +17,12 @@ from surrogates.data.samples import Notes, Runs, Split, scale_of
 from surrogates.models.cascade import Cascade, build_level
 from surrogates.models.level import Level
 from surrogates.models.unified import Unified
+from surrogates.record import Fit
 from surrogates.reductions.reduction import LinearReduction, LinearStart, linear_part
 from surrogates.regression.latent_process import mix_in
 from surrogates.settings import LevelSettings, Settings
 from surrogates.surrogate import Surrogate, level_name
-from surrogates.training.loop import Epoch, Fit, Keeper, Objective, fit, set_up
+from surrogates.training.loop import Epoch, Keeper, Objective, fit, set_up
 from surrogates.training.objectives import CHUNK, LatentObjective, LevelObjective, Samples, UnifiedObjective, as_states
 from surrogates.training.starts import pod_start, start_level, start_unified
 

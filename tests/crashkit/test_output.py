@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from crashkit.errors import OutputError
-from crashkit.output import complete_folder
+from crashkit.output import complete_folder, file_name
 
 
 def test_an_earlier_result_is_replaced_as_a_whole(tmp_path):
@@ -57,3 +57,8 @@ def test_below_a_file_nothing_can_be_made(tmp_path):
         complete_folder(tmp_path / "file" / "out", "mark.json"),
     ):
         pass
+
+
+def test_names_become_file_names():
+    assert file_name("run 1/2 <x>_MH1") == "run-1-2-x-_MH1"
+    assert file_name("../..") == "run"

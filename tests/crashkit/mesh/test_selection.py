@@ -10,7 +10,8 @@ from scipy.sparse.csgraph import connected_components
 from crashkit.errors import MeshError
 from crashkit.mesh.selection import contract_onto, everything, select_quadric
 from crashkit.mesh.selection_vtk import nearest_nodes, select_vtk
-from crashkit.mesh.surface import Surface, adjacency, surface
+from crashkit.mesh.surface import Surface, surface
+from data_schema.edges import adjacency
 
 
 def components(mesh: Surface, edges: np.ndarray, kept: np.ndarray) -> int:

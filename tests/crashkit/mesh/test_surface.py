@@ -7,7 +7,8 @@ import pytest
 from mesh_shapes import plate
 
 from crashkit.errors import MeshError
-from crashkit.mesh.surface import face_edges, surface
+from crashkit.mesh.surface import surface
+from data_schema.edges import face_edges
 
 
 def test_quadrilaterals_are_cut_along_their_shorter_diagonal() -> None:

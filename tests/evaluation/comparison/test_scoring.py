@@ -9,7 +9,7 @@ import pytest
 
 from evaluation.comparison.reference import Reference
 from evaluation.comparison.result import compare, decompose, predictors_of
-from evaluation.comparison.scoring import gather, score_run
+from evaluation.comparison.scoring import contributions, gather, score_run
 from evaluation.comparison.sensors import choose_sensors
 from evaluation.comparison.split import Split
 from evaluation.errors import EvaluationError
@@ -197,3 +197,11 @@ def test_scoring_holds_one_run_and_some_of_its_states(monkeypatch):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 2 * u.nbytes
+
+
+def test_contributions_add_up_to_the_finest():
+    rng = np.random.default_rng(0)
+    lifted = {name: rng.normal(size=(2, 5, 3)) for name in ("MH3", "MH2", "MH1")}
+    parts = contributions(lifted)
+    np.testing.assert_array_equal(parts["MH3"], lifted["MH3"])
+    np.testing.assert_allclose(sum(parts.values()), lifted["MH1"])

@@ -23,8 +23,8 @@ from evaluation.drawing.pictures import (
     states_picture,
     to_png,
 )
+from evaluation.drawing.style import Sheet
 from evaluation.errors import EvaluationError
-from evaluation.figures.style import Sheet
 
 SHEET = Sheet(13.0)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import pyvista as pv
 
-from evaluation.report.files import coarsest_level, contributions, default_runs, file_name, lone_edges, write_run
+from evaluation.report.files import coarsest_level, default_runs, lone_edges, write_run
 
 
 @pytest.fixture(scope="module")
@@ -68,14 +68,6 @@ def test_the_coarse_mesh_stands_alone(written, reference, models):
     np.testing.assert_allclose(mesh["predicted"], expected, atol=1e-6)
 
 
-def test_contributions_add_up_to_the_finest():
-    rng = np.random.default_rng(0)
-    lifted = {name: rng.normal(size=(2, 5, 3)) for name in ("MH3", "MH2", "MH1")}
-    parts = contributions(lifted)
-    np.testing.assert_array_equal(parts["MH3"], lifted["MH3"])
-    np.testing.assert_allclose(sum(parts.values()), lifted["MH1"])
-
-
 def test_lone_edges_are_those_of_no_face():
     faces = np.array([[0, 1, 2]])
     edges = np.array([[0, 1], [1, 2], [0, 2], [2, 3], [3, 4]])
@@ -93,8 +85,3 @@ def test_the_worst_and_the_median_run_of_the_best_model_are_written(evaluation):
     errors = evaluation.scores[evaluation.ranked[0].label].of_runs
     order = np.argsort(errors)
     assert default_runs(evaluation) == (9 + order[2], 9 + order[1])
-
-
-def test_names_become_file_names():
-    assert file_name("run 1/2 <x>_MH1") == "run-1-2-x-_MH1"
-    assert file_name("../..") == "run"

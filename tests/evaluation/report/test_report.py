@@ -15,9 +15,9 @@ import pytest
 
 from evaluation.comparison.result import compare
 from evaluation.comparison.split import Split, agree_on_split
+from evaluation.drawing.style import Sheet, readable, smoothed, styles
 from evaluation.figures import ORDER, drawings, kinds, sheet_of
 from evaluation.figures.kind import drawn, image
-from evaluation.figures.style import Sheet, readable, smoothed, styles
 from evaluation.report.files import write_run
 from evaluation.report.page import plain, show_table
 from evaluation.report.report import write_report

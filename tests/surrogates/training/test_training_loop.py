@@ -12,9 +12,10 @@ import torch
 from torch import Tensor, nn
 
 from surrogates.errors import SurrogateError
+from surrogates.record import Fit
 from surrogates.settings import LevelSettings, settings
 from surrogates.training.checkpoints import Checkpoints
-from surrogates.training.loop import Diverged, Epoch, Fit, Objective, device_of, fit, learning_rates
+from surrogates.training.loop import Diverged, Epoch, Objective, device_of, fit, learning_rates
 from surrogates.training.train import train
 
 SETTINGS = LevelSettings(epochs=12, batch=8, learning_rate=0.05, schedule="one_cycle")
