@@ -1,40 +1,77 @@
 """crashkit: crash runs in, one labelled dataset, a mesh hierarchy and trustworthy surrogates out.
 
 The functions below are what the commands of the same name call; they are imported when first used, so that
-`import crashkit` stays quick.
+`import crashkit` stays quick. Type checkers and editors read the imports under `TYPE_CHECKING`.
 """
 
 from __future__ import annotations
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from crashkit.version import __version__
+from crashkit.register import register_accessor
+from crashkit.version import __version__ as __version__
 
-# Public name -> "module:attribute".
+if TYPE_CHECKING:
+    from crashkit.api.coarsen import coarsen as coarsen
+    from crashkit.api.evaluate import evaluate as evaluate
+    from crashkit.api.predict import load_model as load_model
+    from crashkit.api.predict import predict as predict
+    from crashkit.api.train import train as train
+    from crashkit.dataset import demo_data as demo_data
+    from crashkit.dataset import open_dataset as open_dataset
+    from crashkit.errors import CrashkitError as CrashkitError
+    from crashkit.errors import DataError as DataError
+    from crashkit.errors import MeshError as MeshError
+    from crashkit.errors import OutputError as OutputError
+    from crashkit.errors import ReadError as ReadError
+    from crashkit.ingestion.ingest import IngestSummary as IngestSummary
+    from crashkit.ingestion.ingest import ingest as ingest
+    from crashkit.mesh.levels import Hierarchy as Hierarchy
+    from crashkit.mesh.store import open_hierarchy as open_hierarchy
+    from crashkit.writers.paraview import write_paraview as write_paraview
+    from data_schema import validate as validate
+    from evaluation.comparison.result import Evaluation as Evaluation
+    from evaluation.errors import EvaluationError as EvaluationError
+    from surrogates.errors import SurrogateError as SurrogateError
+
+# Public name -> the module that has it; the same as above (a test compares), imported when first used.
 _LAZY = {
-    "ingest": "crashkit.ingestion.ingest:ingest",
-    "open_dataset": "crashkit.dataset:open_dataset",
-    "open_hierarchy": "crashkit.mesh.store:open_hierarchy",
-    "validate": "data_schema:validate",
-    "coarsen": "crashkit.api.coarsen:coarsen",
-    "train": "crashkit.api.train:train",
-    "load_model": "crashkit.api.predict:load_model",
-    "predict": "crashkit.api.predict:predict",
-    "evaluate": "crashkit.api.evaluate:evaluate",
-    "write_paraview": "crashkit.writers.paraview:write_paraview",
-    "CrashkitError": "crashkit.errors:CrashkitError",
+    "CrashkitError": "crashkit.errors",
+    "DataError": "crashkit.errors",
+    "Evaluation": "evaluation.comparison.result",
+    "EvaluationError": "evaluation.errors",
+    "Hierarchy": "crashkit.mesh.levels",
+    "IngestSummary": "crashkit.ingestion.ingest",
+    "MeshError": "crashkit.errors",
+    "OutputError": "crashkit.errors",
+    "ReadError": "crashkit.errors",
+    "SurrogateError": "surrogates.errors",
+    "coarsen": "crashkit.api.coarsen",
+    "demo_data": "crashkit.dataset",
+    "evaluate": "crashkit.api.evaluate",
+    "ingest": "crashkit.ingestion.ingest",
+    "load_model": "crashkit.api.predict",
+    "open_dataset": "crashkit.dataset",
+    "open_hierarchy": "crashkit.mesh.store",
+    "predict": "crashkit.api.predict",
+    "train": "crashkit.api.train",
+    "validate": "data_schema",
+    "write_paraview": "crashkit.writers.paraview",
 }
 
 __all__ = ["__version__", *_LAZY]
 
+if not TYPE_CHECKING:  # a type checker must not take this for the type of every name
 
-def __getattr__(name: str) -> Any:
-    if name not in _LAZY:
-        raise AttributeError(f"module 'crashkit' has no attribute {name!r}")
-    module, attribute = _LAZY[name].split(":")
-    return getattr(importlib.import_module(module), attribute)
+    def __getattr__(name: str) -> Any:
+        if name not in _LAZY:
+            raise AttributeError(f"module 'crashkit' has no attribute {name!r}")
+        return getattr(importlib.import_module(_LAZY[name]), name)
 
 
 def __dir__() -> list[str]:
     return sorted(__all__)
+
+
+register_accessor()

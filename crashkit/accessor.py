@@ -10,13 +10,13 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from crashkit.errors import DataError
-from data_schema import fields, parameters
-from data_schema.edges import face_edges
+from crashkit.selection import Selection, runs_of
 
 if TYPE_CHECKING:
     import pyvista
 
-from crashkit.selection import Selection, runs_of
+# Importing xarray may import this module in turn (crashkit.register), whoever imports it: also data_schema, which is
+# why nothing of data_schema is imported here but inside functions.
 
 
 @xr.register_dataset_accessor("crash")
@@ -29,6 +29,8 @@ class CrashAccessor:
     @property
     def parameters(self) -> list[str]:
         """Names of the design parameters."""
+        from data_schema import parameters
+
         return parameters(self._dataset)
 
     def split(self, test: Selection, *, seed: int = 0) -> tuple[xr.Dataset, xr.Dataset]:
@@ -74,6 +76,8 @@ class CrashAccessor:
 
     def edges(self) -> NDArray[np.int32]:
         """(e, 2) sides of the faces, each once, i < j."""
+        from data_schema.edges import face_edges
+
         return face_edges(self._dataset["face_nodes"].values)
 
     def surface(self, sim: int | str | None = None) -> pyvista.PolyData:
@@ -94,6 +98,8 @@ class CrashAccessor:
         Eroded faces are left out; nodes that nothing holds any more stay at their undeformed position, with NaN as
         displacement. Raises DataError for a run that is not there.
         """
+        from data_schema import fields
+
         ds = self._run(sim)
         if "time" in ds.dims:
             is_place = isinstance(time, (int, np.integer))
