@@ -15,6 +15,7 @@ from data_schema.layout import (
     Variable,
     fields,
     parameters,
+    table_unit,
 )
 from data_schema.units import UnitSystem, UnknownUnits, si_unit, to_si, unit_system
 from data_schema.validation import Violation, validate
@@ -35,6 +36,7 @@ __all__ = [
     "parameters",
     "run_checksum",
     "si_unit",
+    "table_unit",
     "to_si",
     "unit_system",
     "validate",

@@ -14,6 +14,8 @@ from types import MappingProxyType
 
 import xarray as xr
 
+from data_schema.units import to_si
+
 CONVENTIONS = "CF-1.11 UGRID-1.0"
 
 DIMENSIONS: Mapping[str, str] = MappingProxyType(
@@ -184,6 +186,18 @@ def parameters(dataset: xr.Dataset) -> list[str]:
     except (TypeError, ValueError):
         order = []
     return sorted(found, key=lambda name: order.index(name) if name in order else len(order))
+
+
+def table_unit(dataset: xr.Dataset, name: str) -> tuple[str, float]:
+    """The unit in which the table of parameters gave `name`, and its value in the dataset's unit: ("MPa", 1e6).
+
+    People speak of a parameter in this unit, so it is the one of numbers without a unit. It is the attribute
+    `table_units`; without one, or with one of another kind, it is the dataset's own unit.
+    """
+    attributes = dataset[name].attrs
+    own, written = str(attributes.get("units", "")), str(attributes.get("table_units", ""))
+    factor, si = to_si(written)
+    return (written, factor) if written and si == own else (own, 1.0)
 
 
 def fields(dataset: xr.Dataset) -> list[str]:

@@ -92,7 +92,7 @@ def record_as_dict(record: Record) -> dict[str, Any]:
     out = asdict(record)
     out["ranges"] = {
         "names": list(ranges.names), "units": list(ranges.units), "low": ranges.low.tolist(),
-        "high": ranges.high.tolist(), "time": list(ranges.time),
+        "high": ranges.high.tolist(), "time": list(ranges.time), "table": [list(unit) for unit in ranges.written],
     }  # fmt: skip
     out["time"] = record.time.tolist()
     out["fits"] = {
@@ -109,6 +109,7 @@ def record_from_dict(values: Mapping[str, Any], histories: Mapping[int, dict[str
         ranges=Ranges(
             tuple(ranges["names"]), tuple(ranges["units"]), np.array(ranges["low"], np.float64),
             np.array(ranges["high"], np.float64), (float(ranges["time"][0]), float(ranges["time"][1])),
+            tuple((str(unit), float(factor)) for unit, factor in ranges.get("table", ())),
         ),
         time=np.array(values["time"], np.float64),
         checksum=values["checksum"],

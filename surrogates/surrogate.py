@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 from torch import Tensor
 
+from surrogates.data.campaign import Labels
 from surrogates.data.graphs import Graphs
 from surrogates.errors import SurrogateError
 from surrogates.models.base import Network
@@ -35,6 +36,7 @@ class Surrogate:
     settings, record  what it was asked to be, and what became of it
     graphs            the levels it knows; with them predictions are lifted to the full mesh without the data
     points, faces     the full mesh (node, 3), m, and (face, corner), where the training data told them
+    labels            the solver's numbers and names on it, where the training data told them
     """
 
     def __init__(
@@ -48,6 +50,7 @@ class Surrogate:
     ) -> None:
         self.settings, self.record, self.graphs, self.core = settings, record, graphs, core
         self.points, self.faces = points, faces
+        self.labels: Labels | None = None
         self.bands: dict[tuple[int, bool], Band] = {}
         self._upward: dict[int, sparse.csr_matrix] = {}
 

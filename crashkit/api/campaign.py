@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import numpy as np
+    import xarray as xr
     from numpy.typing import NDArray
 
-    from surrogates.data.campaign import Campaign, GraphLevel
+    from surrogates.data.campaign import Campaign, GraphLevel, Labels
 
 
 class RunField:
@@ -45,7 +46,7 @@ def open_campaign(path: str | Path, test: Any = None) -> Campaign:
     from crashkit.errors import DataError
     from crashkit.mesh.store import level_displacement
     from crashkit.selection import runs_of
-    from data_schema import fields, parameters
+    from data_schema import fields, parameters, table_unit
     from surrogates.data.campaign import Campaign
 
     path = Path(path)
@@ -81,7 +82,18 @@ def open_campaign(path: str | Path, test: Any = None) -> Campaign:
         held_out=tuple(runs[k] for k in held_out),
         points=np.asarray((at.isel(sim=0) if "sim" in at.dims else at).values, np.float64),
         faces=dataset["face_nodes"].values.astype(np.int32),
+        labels=labels_of(dataset),
+        table_units=tuple(table_unit(dataset, n) for n in names),
     )
+
+
+def labels_of(dataset: xr.Dataset) -> Labels:
+    """The solver's numbers and names on the mesh of `dataset`."""
+    from surrogates.data.campaign import Labels
+
+    ids = {n: dataset[n].values.astype("int64") for n in ("node_id", "face_part", "part_id")}
+    face_id = dataset["face_id"].values.astype("int64") if "face_id" in dataset.variables else None
+    return Labels(**ids, part_name=tuple(map(str, dataset["part_name"].values)), face_id=face_id)
 
 
 def _levels(path: Path) -> tuple[GraphLevel, ...]:

@@ -203,7 +203,14 @@ def _small(
     units = old.parameters if old is not None else {n: u for n, (_, u) in fresh.parameters.items()}
     for name, unit in units.items():
         values = np.array([r.parameters[name] for r in rows], np.float64)
-        ds[name] = ("sim", values, {"units": unit, "role": "parameter"})
+        written = (
+            str(old.small[name].attrs.get("table_units", "")) if old is not None else fresh.as_written.get(name, "")
+        )
+        ds[name] = (
+            "sim",
+            values,
+            {"units": unit, "role": "parameter", **({"table_units": written} if written else {})},
+        )
     files = [e for e in old.files() if e["run"] in names and e["run"] not in new] if old is not None else []
     for found in new.values():
         for file in found.files:

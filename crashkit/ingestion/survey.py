@@ -72,6 +72,7 @@ class Found:
     run, index  its name and place in the source; `name` is that in the dataset
     time        (state,) s, its own output times
     parameters  name -> (value, unit), in the dataset's units
+    as_written  name -> unit in which the table or the source gave the parameter, such as MPa; "" where none is said
     fields      the wanted fields that it has
     """
 
@@ -87,6 +88,7 @@ class Found:
     files: tuple[Path, ...]
     end_time: float | None
     complete: bool
+    as_written: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass
@@ -144,7 +146,9 @@ def survey(
                 with reading(source):
                     found = _look(run, name, source, index, choice, out)
                 if table is not None:
-                    found = replace(found, parameters=_from_table(found, table.row(name), out, table.path))
+                    row = table.row(name)
+                    written = {**found.as_written, **{n: unit for n, (_, unit) in row.items()}}
+                    found = replace(found, parameters=_from_table(found, row, out, table.path), as_written=written)
                 out.found.append(_same_parameters(found, out))
             except CrashkitError as error:
                 out.refuse(name, error, stop)
@@ -298,6 +302,7 @@ def _look(run: Run, name: str, source: Path, index: int, choice: Choice, out: Su
         files=tuple(run.files),
         end_time=None if run.end_time is None else run.end_time * system.time,
         complete=not problems,
+        as_written={k: p.unit for k, p in run.parameters.items()},
     )
 
 

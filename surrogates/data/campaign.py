@@ -41,6 +41,20 @@ class GraphLevel:
 
 
 @dataclass(frozen=True)
+class Labels:
+    """The solver's numbers and names on the full mesh, kept so that files written from a model carry them.
+
+    node_id (node,), face_id and face_part (face,) an index into part_id (part,) and part_name; face_id may be missing
+    """
+
+    node_id: NDArray[np.int64]
+    face_part: NDArray[np.int64]
+    part_id: NDArray[np.int64]
+    part_name: tuple[str, ...]
+    face_id: NDArray[np.int64] | None = None
+
+
+@dataclass(frozen=True)
 class Campaign:
     """The runs a surrogate may see, and nothing of the test runs.
 
@@ -56,6 +70,8 @@ class Campaign:
     held_out        names of the runs that were kept away (the test runs), for the record
     checksum        SHA-256 that identifies the dataset
     points, faces   the full mesh (node, 3), m, and (face, corner), stored with the model so that it draws without data
+    labels          the solver's numbers and names on it
+    table_units     for each parameter the unit people write it in, and its value in `parameter_units`: ("MPa", 1e6)
     """
 
     parameters: NDArray[np.float64]
@@ -72,3 +88,5 @@ class Campaign:
     held_out: tuple[str, ...] = ()
     points: NDArray[np.float64] | None = None
     faces: NDArray[np.int32] | None = None
+    labels: Labels | None = None
+    table_units: tuple[tuple[str, float], ...] = ()

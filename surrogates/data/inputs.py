@@ -17,6 +17,7 @@ class Ranges:
 
     low, high  (parameter,) in the parameters' units
     time       first and last time, s
+    table      for each parameter the unit people write it in, and its value in `units`: ("MPa", 1e6)
     """
 
     names: tuple[str, ...]
@@ -24,6 +25,7 @@ class Ranges:
     low: NDArray[np.float64]
     high: NDArray[np.float64]
     time: tuple[float, float]
+    table: tuple[tuple[str, float], ...] = ()
 
     @classmethod
     def of(
@@ -32,6 +34,7 @@ class Ranges:
         units: Sequence[str],
         parameters: NDArray[np.float64],
         time: NDArray[np.float64],
+        table: Sequence[tuple[str, float]] = (),
     ) -> Ranges:
         """The ranges of parameters (run, parameter) and time (state,)."""
         return cls(
@@ -40,7 +43,13 @@ class Ranges:
             parameters.min(axis=0),
             parameters.max(axis=0),
             (float(time[0]), float(time[-1])),
+            tuple(table),
         )
+
+    @property
+    def written(self) -> tuple[tuple[str, float], ...]:
+        """`table`, or the parameters' own units where it says nothing."""
+        return self.table or tuple((unit, 1.0) for unit in self.units)
 
     @property
     def constant(self) -> tuple[str, ...]:
@@ -51,19 +60,40 @@ class Ranges:
         """One sentence for each parameter (and the time) beyond the trained range; parameters (..., parameter)."""
         said = []
         values = np.atleast_2d(parameters)
-        for k, (name, unit) in enumerate(zip(self.names, self.units, strict=True)):
+        for k, (name, (unit, factor)) in enumerate(zip(self.names, self.written, strict=True)):
             low, high = self.low[k], self.high[k]
             column = values[:, k]
             worst = column[np.argmax(np.maximum(low - column, column - high))]
             slack = 1e-9 * max(abs(low), abs(high))
             if worst < low - slack or worst > high + slack:
-                span = f"{low:g} to {high:g}" if low < high else f"only {low:g}"
-                said.append(f"{name} = {worst:g} {unit} is outside the trained range {span} {unit}".rstrip())
+                span = f"{low / factor:g} to {high / factor:g}" if low < high else f"only {low / factor:g}"
+                said.append(f"{name} = {worst / factor:g} {unit} is outside the trained range {span} {unit}".rstrip())
         first, last = self.time
         beyond = [t for t in (time.min(), time.max()) if t < first - 1e-12 or t > last * (1 + 1e-9) + 1e-12]
         if beyond:
             said.append(f"time = {beyond[-1]:g} s is outside the trained range {first:g} to {last:g} s")
         return said
+
+
+FAR = 0.25  # of the trained range: a value further outside is far outside
+
+
+def far_outside(ranges: Ranges, parameters: NDArray[np.float64], time: NDArray[np.float64]) -> list[str]:
+    """Names of the parameters, and "time", that lie outside the trained range by more than a quarter of it.
+
+    A parameter that had one value in training is far outside with any other value.
+    """
+    values = np.atleast_2d(parameters)
+    span = ranges.high - ranges.low
+    slack = FAR * span + 1e-9 * np.maximum(abs(ranges.low), abs(ranges.high))
+    out = [
+        name
+        for k, name in enumerate(ranges.names)
+        if ((values[:, k] < ranges.low[k] - slack[k]) | (values[:, k] > ranges.high[k] + slack[k])).any()
+    ]
+    first, last = ranges.time
+    allowed = FAR * (last - first) + 1e-12
+    return out + (["time"] if time.min() < first - allowed or time.max() > last + allowed else [])
 
 
 class InputScaling(nn.Module):

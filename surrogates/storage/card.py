@@ -27,13 +27,14 @@ def card(surrogate: Surrogate) -> str:
         *_table(
             ("parameter", "unit", "from", "to"),
             [
-                (n, u, f"{a:g}", f"{b:g}")
-                for n, u, a, b in zip(ranges.names, ranges.units, ranges.low, ranges.high, strict=True)
+                (n, u, f"{a / factor:.6g}", f"{b / factor:.6g}")
+                for n, (u, factor), a, b in zip(ranges.names, ranges.written, ranges.low, ranges.high, strict=True)
             ]
             + [("time", "s", f"{ranges.time[0]:g}", f"{ranges.time[1]:g}")],
         ),
         "",
-        "Outside these ranges predictions are extrapolations; `crashkit predict` says so.",
+        "Numbers given to `crashkit predict` without a unit are in these units. Outside these ranges predictions are",
+        "extrapolations: `crashkit predict` says so, and refuses those far outside without `--extrapolate`.",
         "",
         "## Levels",
         "",

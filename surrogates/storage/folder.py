@@ -30,7 +30,7 @@ from safetensors.torch import load_file, save_file
 from scipy import sparse
 from torch import Tensor
 
-from surrogates.data.campaign import GraphLevel
+from surrogates.data.campaign import GraphLevel, Labels
 from surrogates.data.graphs import Graphs
 from surrogates.data.inputs import InputScaling
 from surrogates.errors import ModelFolderError, SurrogateError
@@ -46,6 +46,7 @@ from surrogates.uncertainty import Band
 
 FORMAT = 1
 _MAIN = "model.json"
+_LABELS = ("node_id", "face_part", "part_id", "face_id")
 
 
 def save(surrogate: Surrogate, folder: str | Path, *, overwrite: bool = False) -> Path:
@@ -90,15 +91,18 @@ def load(folder: str | Path) -> Surrogate:
         settings = parse(about["settings"], f"{folder / _MAIN}: settings")
         histories = json.loads((folder / "history.json").read_text(encoding="utf-8"))
         record = record_from_dict(about["record"], {int(k): v for k, v in histories.items()})
-        graphs, points, faces = _graphs(load_file(folder / "graphs.safetensors"))
+        stored = load_file(folder / "graphs.safetensors")
+        graphs, points, faces = _graphs(stored)
         core = _core(folder, about, settings, record, graphs)
         bands = _bands(load_file(folder / "bands.safetensors"), record)
+        labels = _labels(stored, about)
     except ModelFolderError:
         raise
     except (SurrogateError, SafetensorError, KeyError, TypeError, ValueError, IndexError) as error:
         raise ModelFolderError(f"{folder}: does not hold together ({error}); train it again") from error
     surrogate = Surrogate(settings, record, graphs, core, points, faces)
     surrogate.bands = bands
+    surrogate.labels = labels
     return surrogate
 
 
@@ -121,6 +125,7 @@ def _write(surrogate: Surrogate, folder: Path) -> None:
             {"number": k, "name": name, "nodes": surrogate.graphs.n_nodes(k), "scale": _scale(core, k)}
             for name, k in surrogate.level_names.items()
         ],
+        "parts": [] if surrogate.labels is None else list(surrogate.labels.part_name),
         "files": {path.name: _sha256(path.read_bytes()) for path in sorted(folder.iterdir())},
     }
     about["sha256"] = _sha256(_canonical(about))
@@ -178,6 +183,10 @@ def _graph_tensors(surrogate: Surrogate) -> dict[str, Tensor]:
     arrays: dict[str, NDArray] = {"nodes": np.array([graphs.n_full])}
     if surrogate.points is not None and surrogate.faces is not None:
         arrays |= {"points": np.asarray(surrogate.points, np.float64), "faces": np.asarray(surrogate.faces, np.int32)}
+    if surrogate.labels is not None:
+        arrays |= {
+            name: np.asarray(a, np.int64) for name in _LABELS if (a := getattr(surrogate.labels, name)) is not None
+        }
     numbers = surrogate.core.numbers
     if 0 in numbers and isinstance(surrogate.core, Network) and graphs.full_edges is not None:
         arrays["edges"] = graphs.full_edges
@@ -214,6 +223,13 @@ def _graphs(tensors: Mapping[str, Tensor]) -> tuple[Graphs, NDArray[np.float64] 
         )  # fmt: skip
         finer = len(kept)
     return Graphs(n_full, tuple(levels), a.get("edges")), a.get("points"), a.get("faces")
+
+
+def _labels(tensors: Mapping[str, Tensor], about: Mapping[str, Any]) -> Labels | None:
+    if "node_id" not in tensors:
+        return None
+    arrays = {name: tensors[name].numpy() for name in _LABELS if name in tensors}
+    return Labels(**arrays, part_name=tuple(map(str, about["parts"])))
 
 
 def _band_tensors(surrogate: Surrogate) -> dict[str, Tensor]:

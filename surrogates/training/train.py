@@ -49,12 +49,14 @@ def train(
     parts = split(campaign, settings, notes)
     graphs = Graphs.of(campaign)
     ranges = Ranges.of(
-        campaign.parameter_names, campaign.parameter_units, campaign.parameters[parts.training], campaign.time
-    )
+        campaign.parameter_names, campaign.parameter_units, campaign.parameters[parts.training], campaign.time,
+        campaign.table_units,
+    )  # fmt: skip
     trainer = Trainer(campaign, settings, graphs, parts, notes, device_of(device), report, keeper)
     record = Record.of(campaign, settings, ranges, parts)
     record.notes = notes.lines
     surrogate = Surrogate(settings, record, graphs, Cascade(scaling(settings, ranges)), campaign.points, campaign.faces)
+    surrogate.labels = campaign.labels
     if settings.model in ("pod-gpr", "pod-rbf"):
         _fit_regression(surrogate, trainer)
     elif settings.unified:
