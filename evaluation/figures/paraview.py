@@ -47,7 +47,7 @@ class FromFile:
         return (
             f"The last state of {self.path.name}, read back from the file: truth, prediction of {self.model} and "
             f"error. In "
-            f"ParaView, open the .pvd or the .vtkhdf file and warp by displacement or predicted. Arrays: "
+            f"ParaView, open the file and warp by displacement or predicted. Arrays: "
             f"{', '.join(arrays)}; lengths in metres."
         )
 
@@ -58,7 +58,7 @@ def select(evaluation: Evaluation) -> FromFile | None:
 
     best = evaluation.ranked[0]
     ending = file_name(evaluation.model(best).name)
-    found = [p for p in evaluation.files if p.suffix == ".vtkhdf" and p.stem.endswith(f"_{ending}")]
+    found = [p for p in evaluation.files if p.suffix in (".pvd", ".vtkhdf") and p.stem.endswith(f"_{ending}")]
     if not found or rendering_problem() is not None:
         return None
     finest = evaluation.model(best).predictors[0].name

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,6 @@ from evaluation.comparison.scoring import contributions, full_field, mesh_of
 
 # Bytes of one predicted field held at once; several of them are.
 _BUDGET = 64 << 20
-_FORMATS = (".pvd", ".vtkhdf")
 _METRES = ("displacement", "predicted", "error", "error_magnitude")
 
 
@@ -31,8 +30,8 @@ def default_runs(evaluation: Evaluation) -> tuple[int, ...]:
     return tuple(dict.fromkeys(evaluation.split.test[int(k)] for k in chosen))
 
 
-def write_run(evaluation: Evaluation, run: int, folder: Path) -> list[Path]:
-    """Write run number `run` for every model of `evaluation` into `folder`, as PVD with VTU and as VTKHDF.
+def write_run(evaluation: Evaluation, run: int, folder: Path, formats: Sequence[str] = (".pvd",)) -> list[Path]:
+    """Write run number `run` for every model of `evaluation` into `folder`, as `.pvd` with VTU or as `.vtkhdf`.
 
     `RUN_MODEL` stands on the full mesh, with the arrays displacement (true), predicted, error (vector), its
     magnitude, for a cascade the contribution of each level, and coarsest_level: the coarsest level that keeps a
@@ -44,11 +43,11 @@ def write_run(evaluation: Evaluation, run: int, folder: Path) -> list[Path]:
     written = []
     for model in _first_seeds(evaluation):
         name = file_name(f"{reference.runs[run]}_{model.name}")
-        written += _write_full(reference, model, run, truth, folder / name)
+        written += _write_full(reference, model, run, truth, folder / name, formats)
         for predictor in model.predictors:
             if predictor.level > 0:
                 name = file_name(f"{reference.runs[run]}_{model.name}_level{predictor.level}")
-                written += _write_coarse(reference, predictor, run, truth, folder / name)
+                written += _write_coarse(reference, predictor, run, truth, folder / name, formats)
     return written
 
 
@@ -103,7 +102,9 @@ def _step(reference: Reference) -> int:
     return max(1, min(len(reference.time), _BUDGET // (reference.n_nodes * 12)))
 
 
-def _write_full(reference: Reference, model: Model, run: int, truth: NDArray[np.float32], path: Path) -> list[Path]:
+def _write_full(
+    reference: Reference, model: Model, run: int, truth: NDArray[np.float32], path: Path, formats: Sequence[str]
+) -> list[Path]:
     parameters = reference.parameters[run]
     coarsest_first = sorted(model.predictors, key=lambda p: -p.level)
 
@@ -123,7 +124,7 @@ def _write_full(reference: Reference, model: Model, run: int, truth: NDArray[np.
         data["coarsest_level"] = coarsest_level(reference)
     alive = None if reference.alive is None else reference.alive(run)
     written = []
-    for suffix in _FORMATS:
+    for suffix in formats:
         written += write_paraview(
             path.parent / (path.name + suffix), reference.position_of(run), reference.faces, reference.time, data,
             units=_units(data), alive=alive,
@@ -132,7 +133,7 @@ def _write_full(reference: Reference, model: Model, run: int, truth: NDArray[np.
 
 
 def _write_coarse(
-    reference: Reference, predictor: Predictor, run: int, truth: NDArray[np.float32], path: Path
+    reference: Reference, predictor: Predictor, run: int, truth: NDArray[np.float32], path: Path, formats: Sequence[str]
 ) -> list[Path]:
     level = mesh_of(reference, predictor)
     if level is None:
@@ -141,7 +142,7 @@ def _write_coarse(
     data: dict[str, Any] = dict(_errors(own, predictor.predict(reference.parameters[run], reference.time)))
     data["node_id"] = reference.node_id[level.kept]
     written = []
-    for suffix in _FORMATS:
+    for suffix in formats:
         written += write_paraview(
             path.parent / (path.name + suffix), reference.position_of(run)[level.kept], level.faces, reference.time,
             data, lines=lone_edges(level.faces, level.edges), units=_units(data),
