@@ -12,6 +12,14 @@ from pathlib import Path
 from crashkit.errors import OutputError
 
 
+def refuse_earlier(output: Path, mark: str, what: str, option: str = "-o") -> None:
+    """Raise OutputError where `output` holds an earlier result, known by its file `mark`, that nobody asked to replace."""
+    if (output / mark).exists():
+        raise OutputError(
+            f"{output}: holds a {what} already; replace it with --overwrite, or choose another place with -o"
+        )
+
+
 @contextlib.contextmanager
 def complete_folder(output: Path, mark: str) -> Iterator[Path]:
     """A new folder beside `output` that takes its place when the block ends well, and vanishes otherwise.

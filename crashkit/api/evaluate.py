@@ -34,12 +34,14 @@ def evaluate(
     *,
     test: Sequence[str] | None = None,
     write_vtu: bool = False,
+    write_vtkhdf: bool = False,
     vtk_runs: Sequence[str] | None = None,
     probes: Sequence[int] | None = None,
     intrusion: tuple[str, str] | None = None,
     workers: int = 1,
     scheduler: str | None = None,
     seeds_as_spread: bool = True,
+    overwrite: bool = False,
     report: Progress | None = None,
 ) -> Evaluation:
     """Compare stored models on runs none of them has seen, and write everything into the folder `output`.
@@ -47,11 +49,12 @@ def evaluate(
     dataset    path of a crash dataset (.zarr or .nc), with a hierarchy where models work on coarse levels
     models     model folders; those that differ only in their seed become one row with its spread
     test       names of the test runs; default: those that all the models hold out
-    write_vtu  also write PVD + VTU and VTKHDF with truth, prediction and error
+    write_vtu  also write PVD + VTU with truth, prediction and error; write_vtkhdf: the same as VTKHDF
     vtk_runs   the runs written so; default: the worst and the median run of the best model
     probes     the solver's numbers of nodes whose histories are compared; default: four spread over the structure
     intrusion  name of a part and a direction (x, -x, y, -y, z or -z); default: the whole structure, against its motion
     workers    processes that share the runs; `scheduler`, the address of a Dask scheduler, is used instead
+    overwrite  replace an earlier report in `output`
     report     called with what is being done and how far it is
 
     The folder appears under its name when it is complete. Peak memory is one run a worker.
@@ -63,7 +66,7 @@ def evaluate(
     from crashkit.extras import need
 
     need("evaluating models", "train", "report")
-    from crashkit.output import complete_folder
+    from crashkit.output import complete_folder, refuse_earlier
     from evaluation.comparison.result import compare, decompose
     from evaluation.comparison.sensors import choose_sensors
     from evaluation.comparison.split import agree_on_split, entries
@@ -73,6 +76,9 @@ def evaluate(
     from evaluation.report.report import write_report
 
     tell = report or (lambda what, done, total: None)
+    formats = [suffix for suffix, wanted in ((".pvd", write_vtu), (".vtkhdf", write_vtkhdf)) if wanted]
+    if not overwrite:
+        refuse_earlier(Path(output), "report.json", "report")
     paths = (str(dataset), tuple(map(str, models)))
     reference, stored = _opened(*paths)
     split = agree_on_split(reference, stored, test)
@@ -94,12 +100,12 @@ def evaluate(
             reference, stored, split, seeds_as_spread=seeds_as_spread, pods=pods, scored=scored,
             sensors=sensors, context=_context(Path(dataset), reference, stored, split),
         )  # fmt: skip
-        if write_vtu:
+        if formats:
             runs = reference.index(vtk_runs) if vtk_runs else default_runs(result)
             with _counted(tell, "runs for ParaView", len(runs)) as step:
                 written = []
                 for run in runs:
-                    written += write_run(result, run, folder / "vtk")
+                    written += write_run(result, run, folder / "vtk", formats)
                     step(run)
             result = dataclasses.replace(result, files=tuple(written))
         with _counted(tell, "figures", len(kinds())) as step:

@@ -23,7 +23,7 @@ app = typer.Typer(
     name="crashkit",
     help="Crash runs in, one labelled dataset, a mesh hierarchy and trustworthy surrogates out.",
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -45,6 +45,8 @@ def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
             fail(str(error))
         except OSError as error:
             fail(f"{error.filename or 'file'}: {error.strerror or error}")
+        except MemoryError as error:
+            fail(f"not enough memory ({str(error) or 'no details'}); close other programs, or use a machine with more")
         except ImportError as error:
             if (line := explained(error)) is None:
                 raise

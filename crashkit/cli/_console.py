@@ -1,18 +1,22 @@
-"""What all commands share: the two consoles, progress, JSON output, failing, and reading `--param`."""
+"""What all commands share: the two consoles, progress, JSON output, failing, and what to look at next."""
 
 from __future__ import annotations
 
 import json
+import math
+import shlex
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.progress import Progress
+
+    from crashkit.cli._progress import Progress
 
 
 def console(stderr: bool = False) -> Console:
@@ -24,18 +28,27 @@ def console(stderr: bool = False) -> Console:
 
 def fail(message: str, code: int = 1) -> NoReturn:
     """Print one line to stderr and leave with `code`."""
-    typer.echo("error: " + " ".join(message.split()), err=True)
+    say("error: " + " ".join(message.split()))
     raise typer.Exit(code)
 
 
 def say(message: str) -> None:
-    """A line for people, on stderr."""
-    typer.echo(message, err=True)
+    """A line for people, on stderr; what its encoding lacks is written as `\\xe9` instead of ending in an error."""
+    encoding = getattr(sys.stderr, "encoding", None) or "utf-8"
+    typer.echo(message.encode(encoding, "backslashreplace").decode(encoding), err=True)
+
+
+def what_next(look: Path | str | None, *commands: Iterable[object]) -> None:
+    """The last lines of a command: the path to look at, and the next command, ready to be pasted."""
+    if look is not None:
+        say(f"look at  {look}")
+    for command in commands:
+        say("next     crashkit " + shlex.join(map(str, command)))
 
 
 def print_json(value: Any) -> None:
-    """One JSON document on stdout; NaN becomes null, since JSON has none."""
-    typer.echo(json.dumps(_plain(value), indent=2))
+    """One JSON document on stdout; NaN and infinity become null, since JSON has neither."""
+    typer.echo(json.dumps(_plain(value), indent=2, allow_nan=False))
 
 
 def _plain(value: Any) -> Any:
@@ -45,7 +58,7 @@ def _plain(value: Any) -> Any:
         return [_plain(v) for v in value]
     if hasattr(value, "tolist"):
         return _plain(value.tolist())
-    if isinstance(value, float) and value != value:
+    if isinstance(value, float) and not math.isfinite(value):
         return None
     if value is None or isinstance(value, (str, int, float, bool)):
         return value
@@ -53,37 +66,38 @@ def _plain(value: Any) -> Any:
 
 
 @contextmanager
-def progress(quiet: bool = False) -> Iterator[Progress]:
-    """A progress display on stderr; plain and rare lines where stderr is no terminal come from the callers."""
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+def progress(what: str, quiet: bool = False) -> Iterator[Progress]:
+    """Progress on stderr, beginning with `what` is being done: a live line on a terminal, else a line now and then."""
+    from crashkit.cli._progress import Progress
 
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
-        console=console(stderr=True),
-        disable=quiet or not sys.stderr.isatty(),
-    ) as bar:
-        yield bar
+    with Progress(what, quiet=quiet) as shown:
+        yield shown
 
 
 def table(title: str, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
     """A table on stdout; the first column is text, the others are right-aligned."""
     from rich.table import Table
+    from rich.text import Text
 
-    out = Table(title=title, title_justify="left")
+    out = Table(title=Text(title), title_justify="left")
     for k, column in enumerate(columns):
         out.add_column(column, justify="left" if k == 0 else "right")
     for row in rows:
-        out.add_row(*(str(cell) for cell in row))
+        out.add_row(*(Text(str(cell)) for cell in row))
     console().print(out)
+
+
+def numbers(text: str, option: str, example: str, *, whole: bool = False) -> list[Any]:
+    """The numbers of a list such as "8,4,4"; bad usage where it is none."""
+    try:
+        return [int(piece) if whole else float(piece) for piece in text.split(",")] if text else []
+    except ValueError as error:
+        kind = "whole numbers" if whole else "numbers"
+        raise typer.BadParameter(
+            f"{text!r}; expected {kind} with commas between them, such as {example}", param_hint=option
+        ) from error
+
+
+def names(text: str) -> list[str]:
+    """The names of a list such as "floor,pillar*"."""
+    return [piece.strip() for piece in text.split(",") if piece.strip()]

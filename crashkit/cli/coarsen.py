@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from crashkit.api.coarsen import coarsen
-from crashkit.cli._console import print_json, progress, say, table
+from crashkit.cli._console import numbers, print_json, progress, say, table, what_next
 from evaluation.drawing.levels import draw_levels
 
 if TYPE_CHECKING:
@@ -17,25 +17,35 @@ if TYPE_CHECKING:
 
 
 def command(
-    path: Annotated[Path, typer.Argument(help="Dataset (.zarr or .nc) that gets the hierarchy.", show_default=False)],
-    nodes: Annotated[str, typer.Option(help="Exact nodes of each level, finest first: 1165,292,73.")] = "",
+    path: Annotated[
+        Path, typer.Argument(help="Dataset (.zarr or .nc) to which the hierarchy is added.", show_default=False)
+    ],
+    nodes: Annotated[
+        str, typer.Option(help="Number of nodes of each level, finest first: 1165,292,73.", show_default=False)
+    ] = "",
     ratios: Annotated[
-        str, typer.Option(help="Instead: how many times fewer nodes than one level finer.", show_default="8,4,4")
+        str,
+        typer.Option(help="Instead: reduction of each level, 8,4,4 = 1/8, then 1/4 of that, ...", show_default="8,4,4"),
     ] = "",
     selection: Annotated[
-        str, typer.Option(help="quadric (half-edge contraction) or vtk (vtkQuadricDecimation).")
+        str, typer.Option(help="How nodes are selected: quadric (edge contraction) or vtk (vtkQuadricDecimation).")
     ] = "quadric",
     pair_distance: Annotated[
         float | None,
-        typer.Option(help="Nodes closer than this, m, may join without an edge.", show_default="1 % of the size"),
+        typer.Option(
+            help="Merge nodes closer than this (m) even if no edge connects them.", show_default="1 % of the size"
+        ),
     ] = None,
-    picture: Annotated[Path | None, typer.Option(help="Draw all levels side by side into this PNG.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Also draw all levels side by side: levels.png.", show_default="none")
+    ] = None,
     vtp: Annotated[
-        Path | None, typer.Option(help="Write each level as VTP, with the probe maps, into this folder.")
+        Path | None,
+        typer.Option(help="Also write each level as VTP, with its maps, into this folder.", show_default="none"),
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Select the nodes of ever coarser meshes and store them in the dataset, with the maps between them."""
+    """Build coarser meshes (subsets of the nodes) and store them in the dataset, with the maps between them."""
     from crashkit.extras import need
     from crashkit.mesh.store import open_mesh, summarize_hierarchy
 
@@ -43,24 +53,18 @@ def command(
         need("--picture", "report")
     if selection not in ("quadric", "vtk"):
         raise typer.BadParameter(f"{selection!r}; expected quadric or vtk", param_hint="--selection")
-    counts = [int(n) for n in _numbers(nodes, "--nodes", "1165,292,73", whole=True)]
-    factors = _numbers(ratios, "--ratios", "8,4,4")
+    counts = [int(n) for n in numbers(nodes, "--nodes", "1165,292,73", whole=True)]
+    factors = numbers(ratios, "--ratios", "8,4,4")
     if counts and factors:
         raise typer.BadParameter("give either --nodes or --ratios", param_hint="--ratios")
-    say(f"{path}: selecting nodes, then one pass over the runs")
-    with progress(quiet=json) as bar:
-        task = bar.add_task("reading runs", total=None, note="")
-
-        def report(done: int, runs: int) -> None:
-            bar.update(task, completed=done, total=runs)
-
+    with progress(f"selecting the nodes of {path}", quiet=json) as shown:
         hierarchy = coarsen(
             path,
             counts or None,
             factors or None,
             selection="vtk" if selection == "vtk" else "quadric",
             pair_distance=pair_distance,
-            report=report,
+            report=lambda done, runs: shown.step("interpolation errors", done, runs),
         )
     levels = summarize_hierarchy(path)
     mesh = open_mesh(path)
@@ -77,9 +81,17 @@ def command(
             }
         )
         return
+    show(path, levels)
+    if files:
+        say(f"levels as VTP: {vtp}")
+    what_next(picture if drawn else path, ("train", path, "-o", "model", "--test", "0.25"))
+
+
+def show(path: Path, levels: list[dict[str, Any]]) -> None:
+    """What each level is, and what it costs."""
     table(
         f"Mesh hierarchy of {path}",
-        ("level", "nodes", "faces", "edges", "distance mean / max (cm)", "lifting error mean / max (cm)"),
+        ("level", "nodes", "faces", "edges", "distance mean / max (cm)", "interpolation error mean / max (cm)"),
         (
             (
                 row["level"],
@@ -92,21 +104,6 @@ def command(
             for row in levels
         ),
     )
-    if files:
-        say(f"levels as VTP: {vtp}")
-    if drawn:
-        say(f"picture: {picture}")
-
-
-def _numbers(text: str, option: str, example: str, whole: bool = False) -> list[float]:
-    """The numbers of a list such as "8,4,4"."""
-    try:
-        return [int(piece) if whole else float(piece) for piece in text.split(",")] if text else []
-    except ValueError as error:
-        kind = "whole numbers" if whole else "numbers"
-        raise typer.BadParameter(
-            f"{text!r}; expected {kind} with commas between them, such as {example}", param_hint=option
-        ) from error
 
 
 def _write_levels(folder: Path, hierarchy: Hierarchy, mesh: MeshArrays) -> list[Path]:

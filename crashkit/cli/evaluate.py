@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from crashkit.api.evaluate import evaluate
-from crashkit.cli._console import fail, print_json, progress, say, table
+from crashkit.cli._console import fail, print_json, progress, say, table, what_next
 
 if TYPE_CHECKING:
-    pass
+    from evaluation.comparison.result import Evaluation
 
 
 def command(
@@ -20,58 +20,77 @@ def command(
     models: Annotated[list[Path], typer.Argument(help="Model folders made by `crashkit train`.", show_default=False)],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the report.")] = Path("report"),
     test: Annotated[
-        str, typer.Option(help="Test runs: 27:36, or names with commas.", show_default="those the models hold out")
+        str, typer.Option(help="Test runs: 27:36, or names.", show_default="those held out in training")
     ] = "",
-    write_vtu: Annotated[
-        bool, typer.Option("--write-vtu", help="Also write PVD + VTU and VTKHDF for ParaView.")
+    write_vtu: Annotated[bool, typer.Option("--write-vtu", help="Also write runs for ParaView, as PVD + VTU.")] = False,
+    write_vtkhdf: Annotated[
+        bool, typer.Option("--write-vtkhdf", help="Also write runs for ParaView, as VTKHDF.")
     ] = False,
     vtk_runs: Annotated[
-        str, typer.Option(help="Runs written for ParaView.", show_default="the worst and the median of the best model")
+        str, typer.Option(help="Runs written for ParaView.", show_default="worst and median run of the best model")
     ] = "",
     probes: Annotated[
-        str, typer.Option(help="Nodes whose histories are compared: 12,340.", show_default="four, spread out")
+        str, typer.Option(help="Node ids whose curves are compared: 12,340.", show_default="four, spread out")
     ] = "",
     intrusion: Annotated[
-        str, typer.Option(help="Part and direction: floor:-x.", show_default="the structure, against its motion")
+        str,
+        typer.Option(
+            help="Part and direction of the intrusion: floor:-x.", show_default="structure, against its motion"
+        ),
     ] = "",
-    workers: Annotated[int, typer.Option(min=1, help="Processes that share the test runs.")] = 1,
-    scheduler: Annotated[str, typer.Option(help="Address of a Dask scheduler instead.", show_default="none")] = "",
+    workers: Annotated[int, typer.Option(min=1, help="Number of processes on this machine.")] = 1,
+    scheduler: Annotated[
+        str, typer.Option(help="Use this Dask scheduler (address) instead.", show_default="none")
+    ] = "",
     seeds_as_spread: Annotated[
-        bool, typer.Option(help="Models that differ only in their seed make one row with its spread.")
+        bool, typer.Option(help="Show models that differ only in their seed as one row with its spread.")
     ] = True,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the report that is there.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the performance table as JSON.")] = False,
 ) -> None:
-    """Compare models on runs they have never seen: report, figures, numbers, ParaView files."""
+    """Compare models on test runs none of them has seen: report, figures, numbers, ParaView files."""
     from dataclasses import asdict
 
     from crashkit.dataset import open_dataset
     from evaluation.report.tables import performance
-    from evaluation.report.verdict import statements
 
-    names = tuple(map(str, open_dataset(dataset)["sim"].values)) if test or vtk_runs else ()
-    with progress() as bar:
-        tasks: dict[str, Any] = {}
-
-        def follow(what: str, done: int, total: int) -> None:
-            if what not in tasks:
-                tasks[what] = bar.add_task(what, total=total or None, note="")
-                if bar.disable:
-                    say(f"{what} ...")
-            bar.update(tasks[what], completed=done)
-
+    with progress(f"reading {dataset}", quiet=as_json) as shown:
+        names: tuple[str, ...] = ()
+        if test or vtk_runs:
+            with open_dataset(dataset, chunks=None) as opened:
+                names = tuple(map(str, opened["sim"].values))
         result = evaluate(
             dataset, models, output,
             test=_named(names, test) if test else None,
-            write_vtu=write_vtu,
+            write_vtu=write_vtu, write_vtkhdf=write_vtkhdf,
             vtk_runs=_named(names, vtk_runs if ":" in vtk_runs else vtk_runs.split(",")) if vtk_runs else None,
             probes=_node_numbers(probes) if probes else None,
             intrusion=_part_and_direction(intrusion) if intrusion else None,
-            workers=workers, scheduler=scheduler or None, seeds_as_spread=seeds_as_spread, report=follow,
+            workers=workers, scheduler=scheduler or None, seeds_as_spread=seeds_as_spread, overwrite=overwrite,
+            report=shown.step,
         )  # fmt: skip
-    rows = performance(result)
     if as_json:
+        rows = performance(result)
         print_json({"output": output, "report": output / "report.html", "performance": [asdict(r) for r in rows]})
         return
+    show(result)
+    for path in sorted((*(output / "vtk").glob("*.pvd"), *(output / "vtk").glob("*.vtkhdf"))):
+        if "_level" not in path.stem:
+            say(f"ParaView {path}")
+    best = Path(next(m for m in models if m.resolve().name == result.model(result.ranked[0]).name))
+    what_next(output / "report.html", ("predict", best, "--run", result.test_names[0], "--dataset", dataset))
+
+
+def show(result: Evaluation) -> None:
+    """The warnings of the report, its first table and its recommendations."""
+    from evaluation.report.tables import performance
+    from evaluation.report.verdict import statements
+
+    said = statements(result)
+    for statement in said:
+        if statement.kind == "warning":
+            say(f"warning: {statement.about}: {statement.text}")
+    rows = performance(result)
     several = any(row.seeds > 1 for row in rows)
     table(
         f"Mean node error of {len(result.runs)} test runs on the full mesh, cm",
@@ -85,12 +104,9 @@ def command(
             for r in rows
         ),
     )  # fmt: skip
-    for said in statements(result):
-        if said.kind == "use":
-            say(f"  {said.about}: {said.text}")
-    say("")
-    for path in (output / "report.html", output / "report.json", *sorted((output / "vtk").glob("*.pvd"))):
-        say(f"  {path}")
+    for statement in said:
+        if statement.kind == "use":
+            say(f"  {statement.about}: {statement.text}")
 
 
 def _named(names: Sequence[str], chosen: str | list[str]) -> list[str]:
@@ -115,4 +131,4 @@ def _part_and_direction(text: str) -> tuple[str, str]:
 
 
 def _or_dash(value: float, form: str) -> str:
-    return format(value, form) if value == value else "–"
+    return format(value, form) if value == value else "-"

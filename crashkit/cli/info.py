@@ -1,146 +1,81 @@
-"""`crashkit info`: what an engineer asks first about a dataset."""
+"""`crashkit info`: what an engineer asks first about a dataset, a model or a report."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from crashkit.cli._console import console, print_json, progress, say, table
-
-if TYPE_CHECKING:
-    import xarray as xr
+from crashkit.cli._console import console, print_json, progress, table, what_next
 
 # How values of these units are shown to people: factor and unit. JSON keeps SI.
 _SHOWN = {"Pa": (1e-6, "MPa"), "s": (1e3, "ms"), "m": (1e3, "mm")}
-
-
-def describe(dataset: xr.Dataset, path: Path) -> dict[str, Any]:
-    """The facts about the dataset at `path` in SI units; reads the displacements once, block by block.
-
-    Raises ReadError if values cannot be read.
-    """
-    from data_schema import fields, parameters
-
-    size = dataset.sizes
-    part_faces = _counts(dataset, "face_part")
-    part_cells = _counts(dataset, "cell_part")
-    known = dataset.attrs
-    return {
-        "path": path,
-        "bytes_on_disk": _bytes(path),
-        "title": known.get("title"),
-        "solver": known.get("solver"),
-        "units_read": known.get("units_read"),
-        "runs": size["sim"],
-        "incomplete_runs": [str(n) for n in dataset["sim"].values[~dataset["complete"].values]] if "complete" in dataset else [],
-        "states": size["time"],
-        "time_begin": float(dataset["time"].values[0]),
-        "time_end": float(dataset["time"].values[-1]),
-        "alignment_error": float(dataset["alignment_error"].max()) if "alignment_error" in dataset else None,
-        "nodes": size["node"],
-        "faces": size["face"],
-        "cells": size.get("cell", 0),
-        "one_shape": "sim" not in dataset["reference_position"].dims,
-        "parts": [
-            {"id": int(number), "name": str(name), "faces": part_faces[k], "cells": part_cells[k]}
-            for k, (number, name) in enumerate(zip(dataset["part_id"].values, dataset["part_name"].values, strict=True))
-        ],
-        "parameters": [
-            {
-                "name": name,
-                "units": str(dataset[name].attrs.get("units", "")),
-                "least": float(dataset[name].min()),
-                "largest": float(dataset[name].max()),
-            }
-            for name in parameters(dataset)
-        ],
-        "fields": [
-            {"name": name, "on": str(dataset[name].dims[2]), "units": str(dataset[name].attrs.get("units", ""))}
-            for name in fields(dataset)
-        ],
-        "erodes": "alive" in dataset or "cell_alive" in dataset,
-        "largest_displacement": _largest(dataset),
-        "checksum": known.get("checksum"),
-        "levels": _levels(path),
-    }  # fmt: skip
-
-
-def _counts(dataset: xr.Dataset, name: str) -> list[int]:
-    import numpy as np
-
-    owners = dataset[name].values if name in dataset else np.empty(0, int)
-    return [int(n) for n in np.bincount(owners, minlength=dataset.sizes["part"])]
-
-
-def _largest(dataset: xr.Dataset) -> dict[str, Any]:
-    """The largest displacement of all: value (m), run, time (s), node_id; an empty dictionary if none is a number."""
-    import numpy as np
-
-    from data_schema.checksum import result_blocks
-
-    best: dict[str, Any] = {}
-    for k, run in enumerate(dataset["sim"].values):
-        for first, _, u in result_blocks(dataset["displacement"].isel(sim=k)):
-            squared = np.nan_to_num(np.einsum("tnx,tnx->tn", u, u), nan=-1.0)
-            state, node = (int(i) for i in np.unravel_index(int(squared.argmax()), squared.shape))
-            value = float(squared[state, node])
-            if value >= 0 and value**0.5 > best.get("value", -1.0):
-                best = {
-                    "value": value**0.5,
-                    "run": str(run),
-                    "time": float(dataset["time"].values[state]),
-                    "node_id": int(dataset["node_id"].values[first + node]),
-                }
-    return best
-
-
-def _bytes(path: Path) -> int:
-    return sum(f.stat().st_size for f in path.rglob("*") if f.is_file()) if path.is_dir() else path.stat().st_size
-
-
-def _levels(path: Path) -> list[dict[str, Any]]:
-    from crashkit.mesh.store import has_hierarchy, summarize_hierarchy
-
-    return list(summarize_hierarchy(path)) if has_hierarchy(path) else []
+_SPLIT = (("training_runs", "training"), ("validation_runs", "validation"), ("held_out_runs", "held out for testing"))
 
 
 def command(
-    path: Annotated[Path, typer.Argument(help="Dataset (.zarr or .nc).", show_default=False)],
+    path: Annotated[
+        Path, typer.Argument(help="Dataset (.zarr or .nc), model folder or report folder.", show_default=False)
+    ],
     as_json: Annotated[bool, typer.Option("--json", help="Print as JSON, in SI units.")] = False,
     report: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for a data card: coverage, singular values, envelopes, unusual runs.", show_default="none"
+            help="Also write a data card of the dataset (coverage, singular values, unusual runs) into this folder.",
+            show_default="none",
         ),
     ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the data card that is there.")] = False,
 ) -> None:
-    """Print runs, states, time span, mesh, parts, parameters, largest displacement, size, and the mesh hierarchy."""
-    from crashkit.dataset import open_dataset, reading
-    from crashkit.extras import need
+    """Describe a dataset, a model folder or a report.
 
-    with open_dataset(path, chunks=None) as dataset, reading(path):
-        found = describe(dataset, path)
+    Of a dataset: runs, states, mesh, parts, parameters with their units, largest displacement, mesh hierarchy.
+    """
+    if (path / "model.json").exists():
+        from crashkit.api.describe import describe_model
+        from crashkit.api.predict import load_model
+
+        with progress(f"reading {path}", quiet=as_json):
+            found = describe_model(load_model(path), path)
+        print_json(found) if as_json else _print_model(found)
+    elif (path / "report.json").exists():
+        from crashkit.api.describe import describe_report
+
+        found = describe_report(path)
+        print_json(found) if as_json else _print_report(found)
+    else:
+        found = _dataset(path, report, overwrite, as_json)
+        print_json(found) if as_json else _print_dataset(found)
+        if report is not None and not as_json:
+            what_next(found["report"])
+
+
+def _dataset(path: Path, report: Path | None, overwrite: bool, quiet: bool) -> dict[str, Any]:
+    from crashkit.api.describe import describe_dataset
+    from crashkit.dataset import open_dataset, reading
+
+    with (
+        progress(f"reading {path}", quiet=quiet) as shown,
+        open_dataset(path, chunks=None) as dataset,
+        reading(path),
+    ):
+        found = describe_dataset(dataset, path)
         if report is not None:
-            need("a data card (--report)", "report")
+            from crashkit.output import refuse_earlier
             from evaluation.report.datacard import write_card
 
-            with progress() as bar:
-                task = bar.add_task("runs", total=dataset.sizes["sim"], note="")
-                found["report"] = write_card(
-                    dataset, report, about={"Dataset": path.name}, done=lambda run: bar.advance(task)
-                )
-    if as_json:
-        print_json(found)
-        return
-    _print(found)
-    if report is not None:
-        say(f"data card: {found['report']}")
+            if not overwrite:
+                refuse_earlier(report, "card.json", "data card", option="--report")
+            runs = dataset.sizes["sim"]
+            found["report"] = write_card(
+                dataset, report, about={"Dataset": path.name}, done=lambda run: shown.step("runs", run + 1, runs)
+            )
+    return found
 
 
-def _print(found: dict[str, Any]) -> None:
+def _print_dataset(found: dict[str, Any]) -> None:
     out = console()
 
     def line(name: str, text: str) -> None:
@@ -154,7 +89,7 @@ def _print(found: dict[str, Any]) -> None:
     line(
         "states",
         f"{found['states']}, {_shown(found['time_begin'], 's')} to {_shown(found['time_end'], 's')}"
-        + (f", brought to common times (error up to {_shown(moved, 'm')})" if moved else ""),
+        + (f", interpolated to common times (error up to {_shown(moved, 'm')})" if moved else ""),
     )
     shapes = "" if found["one_shape"] else "; every run has its own shape"
     line("mesh", f"{found['nodes']} nodes, {found['faces']} faces, {found['cells']} solids and beams{shapes}")
@@ -166,23 +101,15 @@ def _print(found: dict[str, Any]) -> None:
         where = f"run {most['run']}, {_shown(most['time'], 's')}, node {most['node_id']}"
         line("largest", f"displacement {_shown(most['value'], 'm')} ({where})")
     if found["parameters"]:
-        rows = [
-            (
-                p["name"],
-                *(_shown(p[end], p["units"], with_unit=False) for end in ("least", "largest")),
-                _unit(p["units"]),
-            )
-            for p in found["parameters"]
-        ]
-        table("parameters", ("name", "least", "largest", "unit"), rows)
+        _print_parameters(found["parameters"])
     else:
         line("parameters", "none")
     if not found["levels"]:
-        line("hierarchy", "none yet; crashkit coarsen makes one")
+        line("hierarchy", f"none yet; make one with crashkit coarsen {found['path']}")
         return
     table(
         "mesh hierarchy",
-        ("level", "nodes", "faces", "distance mean / max (mm)", "lifting error mean / max (cm)"),
+        ("level", "nodes", "faces", "distance mean / max (mm)", "interpolation error mean / max (cm)"),
         [
             (
                 level["level"], level["nodes"], level["faces"],
@@ -192,6 +119,64 @@ def _print(found: dict[str, Any]) -> None:
             for level in found["levels"]
         ],
     )  # fmt: skip
+
+
+def _print_parameters(known: list[dict[str, Any]]) -> None:
+    """Ranges in the units of the parameter table, in which numbers given to `crashkit predict` are understood."""
+    rows = [
+        (p["name"], *(f"{p[end] / p['table_factor']:.6g}" for end in ("min", "max")), p["table_units"]) for p in known
+    ]
+    table("parameters", ("name", "min", "max", "unit"), rows)
+
+
+def _print_model(found: dict[str, Any]) -> None:
+    out = console()
+    out.print(
+        f"{found['path']}: {found['kind']} model ({found['preset']}), {found['bytes_on_disk'] / 1e6:.1f} MB, trained "
+        f"{found['created']} with seed {found['seed']}",
+        markup=False,
+    )
+    out.print(f"  dataset     {found.get('dataset', 'unknown')}, checksum {found['checksum'][:12]}", markup=False)
+    runs = [f"{len(found[k])} {what}" for k, what in _SPLIT if found[k]]
+    out.print(f"  runs        {', '.join(runs)}", markup=False)
+    span = f"{_shown(found['time_begin'], 's')} to {_shown(found['time_end'], 's')}"
+    out.print(f"  states      {found['states']}, {span}; full mesh {found['nodes']} nodes", markup=False)
+    _print_parameters(found["parameters"])
+    table(
+        "levels",
+        ("model", "level", "nodes", "latent", "parameters", "validation error (cm)", "on the full mesh (cm)", "band"),
+        [
+            (
+                r["model"], r["level"], r["nodes"], r["latent"], r["parameters"],
+                *("-" if r[k] is None else f"{100 * r[k]:.2f}" for k in ("validation_error", "validation_error_full")),
+                "yes" if r["has_band"] else "no",
+            )
+            for r in found["levels"]
+        ],
+    )  # fmt: skip
+    for note in found["notes"]:
+        out.print(f"  note: {note}", markup=False)
+
+
+def _print_report(found: dict[str, Any]) -> None:
+    rows = [
+        (
+            str(r.get("model")), *(_number(r.get(k), 1.0) for k in ("nodes", "error_cm")),
+            _number(r.get("relative"), 100.0), _number(r.get("worst_run_cm"), 1.0),
+        )
+        for r in found["performance"]
+    ]  # fmt: skip
+    runs = found.get("test_runs", [])
+    table(
+        f"{found['path']}: mean node error of {len(runs)} test runs on the full mesh, cm",
+        ("model", "nodes", "error", "% of motion", "worst run"),
+        rows,
+    )
+    what_next(Path(found["path"]) / "report.html")
+
+
+def _number(value: object, factor: float) -> str:
+    return f"{factor * value:.4g}" if isinstance(value, (int, float)) else "-"
 
 
 def _shown(value: float, unit: str, *, with_unit: bool = True) -> str:

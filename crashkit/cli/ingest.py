@@ -3,83 +3,82 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from crashkit.cli._console import fail, print_json, progress, say, table
+from crashkit.cli._console import fail, names, print_json, progress, say, table, what_next
 
-# Where no progress bar can be shown.
-_SECONDS_BETWEEN_LINES = 10
+if TYPE_CHECKING:
+    from crashkit.ingestion.ingest import IngestSummary
 
 
 def command(
-    sources: Annotated[list[Path], typer.Argument(help="Files or folders with runs.", show_default=False)],
+    sources: Annotated[list[Path], typer.Argument(help="Files or folders with solver runs.", show_default=False)],
     output: Annotated[Path, typer.Option("--output", "-o", help="Dataset to write: NAME.zarr or NAME.nc.")],
     params: Annotated[
-        Path | None, typer.Option(help="Table of design parameters, a row a run: CSV, JSON or XLSX.")
+        Path | None,
+        typer.Option(help="Table of design parameters, one row per run: CSV, JSON or XLSX.", show_default="none"),
     ] = None,
-    units: Annotated[str | None, typer.Option(help="Unit system of the source: SI, mm-ms-kg, mm-s-t, ...")] = None,
-    reader: Annotated[str | None, typer.Option(help="Source format, where it shall not be told by content.")] = None,
-    mesh: Annotated[Path | None, typer.Option(help="Mesh file with the faces, where the source has none.")] = None,
+    units: Annotated[
+        str | None,
+        typer.Option(help="Unit system of the source: SI, mm-ms-kg, mm-s-t, ...", show_default="from the source"),
+    ] = None,
+    reader: Annotated[
+        str | None, typer.Option(help="Use this reader instead of detecting the format.", show_default=False)
+    ] = None,
+    mesh: Annotated[
+        Path | None, typer.Option(help="Mesh file with the faces, if the source has none.", show_default=False)
+    ] = None,
     time_step: Annotated[
         float | None,
-        typer.Option(
-            help="Time between two states, in the source's unit, where the source has none.", show_default=False
-        ),
+        typer.Option(help="Time between two states in the source's unit, if it has no times.", show_default=False),
     ] = None,
-    names: Annotated[
-        str, typer.Option(help="Names of the runs, from {run} and {source}, such as {source}-{run}.")
+    run_names: Annotated[
+        str, typer.Option("--names", help="Names of the runs, from {run} and {source}: {source}-{run}.")
     ] = "{run}",
-    parts: Annotated[str, typer.Option(help="Only these parts: numbers, titles or patterns, with commas.")] = "",
-    exclude_parts: Annotated[str, typer.Option(help="Without these parts.")] = "",
-    keep_rigid_walls: Annotated[
-        bool, typer.Option("--keep-rigid-walls", help="Keep what the solver drew of walls.")
-    ] = False,
-    fields: Annotated[str, typer.Option(help="Further result fields, such as plastic_strain,velocity.")] = "",
+    parts: Annotated[str, typer.Option(help="Keep only these parts: numbers, titles or patterns.")] = "",
+    exclude_parts: Annotated[str, typer.Option(help="Leave out these parts.")] = "",
+    keep_rigid_walls: Annotated[bool, typer.Option("--keep-rigid-walls", help="Keep rigid-wall elements.")] = False,
+    fields: Annotated[str, typer.Option(help="Further result fields to keep, such as plastic_strain,velocity.")] = "",
     time: Annotated[
-        str, typer.Option(help="Common output times: begin:end:count, s. Default: the coarsest run's.")
+        str,
+        typer.Option(
+            help="Common output times in s, begin:end:count, such as 0:0.03:61.", show_default="the runs' own"
+        ),
     ] = "",
-    on_error: Annotated[str, typer.Option(help="stop, or skip runs that cannot be used.")] = "stop",
+    on_error: Annotated[str, typer.Option(help="stop at a run that cannot be used, or skip it.")] = "stop",
     allow_incomplete: Annotated[
-        bool, typer.Option("--allow-incomplete", help="Take runs that were cut short.")
+        bool, typer.Option("--allow-incomplete", help="Accept runs that were cut short.")
     ] = False,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Read runs again that the dataset already holds.")
+        bool, typer.Option("--overwrite", help="Replace runs that the dataset already holds.")
     ] = False,
-    workers: Annotated[int, typer.Option(help="Processes on this machine.", min=1)] = 1,
-    scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler to use instead.")] = None,
+    workers: Annotated[int, typer.Option(help="Number of processes on this machine.", min=1)] = 1,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Use this Dask scheduler (address) instead.", show_default="none")
+    ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Read solver runs, check them, and write them as one labelled dataset in SI units.
 
-    Interrupted or killed, the same command goes on where it was. New runs are appended to an existing dataset.
+    After an interruption the same command continues. New runs are appended to an existing dataset.
     """
     from dataclasses import asdict
-    from time import monotonic
 
     from crashkit.ingestion.ingest import ingest
 
     if on_error not in ("stop", "skip"):
         raise typer.BadParameter(f"{on_error!r}; expected stop or skip", param_hint="--on-error")
-    with progress(quiet=json) as bar:
-        task = bar.add_task("ingest", total=None, note="")
-        last = monotonic()
-
-        def tell(done: int, total: int, note: str) -> None:
-            nonlocal last
-            bar.update(task, completed=done, total=total or None, note=note)
-            if bar.disable and not json and monotonic() - last > _SECONDS_BETWEEN_LINES:
-                last = monotonic()
-                say(f"{done} of {total or '?'} runs, {note}")
-
+    with progress("looking for runs", quiet=json) as shown:
         try:
             summary = ingest(
-                sources, output, params=params, units=units, reader=reader, mesh=mesh, time_step=time_step, names=names,
-                parts=_list(parts), exclude_parts=_list(exclude_parts), keep_rigid_walls=keep_rigid_walls,
-                fields=_list(fields), time=_times(time), on_error="skip" if on_error == "skip" else "stop",
-                allow_incomplete=allow_incomplete, overwrite=overwrite, workers=workers, scheduler=scheduler,
-                progress=tell,
+                sources, output, params=params, units=units, reader=reader, mesh=mesh, time_step=time_step,
+                names=run_names, parts=names(parts), exclude_parts=names(exclude_parts),
+                keep_rigid_walls=keep_rigid_walls, fields=names(fields), time=_times(time),
+                on_error="skip" if on_error == "skip" else "stop", allow_incomplete=allow_incomplete,
+                overwrite=overwrite, workers=workers, scheduler=scheduler,
+                progress=lambda done, total, note: shown.step("ingest", done, total, note),
             )  # fmt: skip
         except KeyboardInterrupt:
             partial = output.with_name(output.name + ".partial")
@@ -88,6 +87,12 @@ def command(
     if json:
         print_json(asdict(summary))
         return
+    show(summary)
+    what_next(output, ("info", output), ("coarsen", output))
+
+
+def show(summary: IngestSummary) -> None:
+    """What became of the runs."""
     for note in summary.notes:
         say(f"  {note}")
     for run, reason in summary.skipped.items():
@@ -95,7 +100,7 @@ def command(
     errors = summary.alignment_error
     if any(errors.values()):
         table(
-            "Runs brought to common times",
+            "Runs interpolated to common times",
             ("run", "estimated error (mm)"),
             [(run, f"{1e3 * error:.3g}") for run, error in errors.items() if error > 0],
         )
@@ -108,10 +113,6 @@ def command(
     told = ", ".join(f"{count} {what}" for count, what in counts if count)
     resumed = f"; {summary.resumed} were read by an earlier start" if summary.resumed else ""
     say(f"{summary.output}: {len(summary.runs)} runs ({told}{resumed}), {summary.states} states, {summary.nodes} nodes")
-
-
-def _list(text: str) -> list[str]:
-    return [piece.strip() for piece in text.split(",") if piece.strip()]
 
 
 def _times(text: str) -> list[float] | None:

@@ -2,83 +2,98 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from crashkit.api.train import interrupted, train
-from crashkit.cli._console import print_json, progress, say, table
+from crashkit.cli._console import print_json, progress, say, table, what_next
 
 if TYPE_CHECKING:
+    from crashkit.cli._progress import Progress
     from surrogates.surrogate import Surrogate
     from surrogates.training.loop import Epoch
 
 
 def command(
-    dataset: Annotated[Path, typer.Argument(help="Dataset (.zarr or .nc) with a hierarchy.", show_default=False)],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Model folder.")],
-    model: Annotated[str, typer.Option(help="mh, podnn, aenn, gaenn, pod-gpr or pod-rbf.", show_default="mh")] = "",
-    preset: Annotated[
-        str, typer.Option(help="fast, or paper for exactly what the paper does.", show_default="fast")
+    dataset: Annotated[Path, typer.Argument(help="Dataset (.zarr or .nc) with a mesh hierarchy.", show_default=False)],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Model folder to write.")],
+    model: Annotated[
+        str, typer.Option(help="Kind of model: mh, podnn, aenn, gaenn, pod-gpr or pod-rbf.", show_default="mh")
     ] = "",
-    config: Annotated[Path | None, typer.Option(help="Settings as YAML.", show_default=False)] = None,
+    preset: Annotated[
+        str, typer.Option(help="Starting values of the settings: fast, or paper (as published).", show_default="fast")
+    ] = "",
+    config: Annotated[Path | None, typer.Option(help="YAML file with settings.", show_default=False)] = None,
     settings: Annotated[
-        list[str] | None, typer.Option("--set", help="One setting: level.latent=8. Repeat for more.")
+        list[str] | None, typer.Option("--set", help="One setting, such as level.latent=8; repeat for more.")
     ] = None,
     test: Annotated[
-        str, typer.Option(help="Runs nobody may see: 27:36, names with commas, a number or a fraction.")
+        str, typer.Option(help="Runs held out for testing: 27:36, names, a count or a fraction.", show_default="none")
     ] = "",
-    epochs: Annotated[int | None, typer.Option(help="Epochs of every level.", min=1, show_default=False)] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed.", min=0, show_default=False)] = None,
+    epochs: Annotated[
+        int | None, typer.Option(help="Epochs of every level.", min=1, show_default="from the settings")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Random seed.", min=0, show_default="from the settings")] = None,
     device: Annotated[str, typer.Option(help="cpu, cuda, mps or auto.")] = "auto",
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted training.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted training.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the model that is there.")] = False,
-    tensorboard: Annotated[Path | None, typer.Option(help="Folder for TensorBoard files.", show_default=False)] = None,
+    tensorboard: Annotated[Path | None, typer.Option(help="Folder for TensorBoard files.", show_default="none")] = None,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Also show the losses.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Train a surrogate and store it as a folder. Ctrl-C ends early and stores what there is."""
+    """Train a surrogate and store it as a folder. Ctrl-C stops early and keeps the best weights so far."""
     given = list(settings or ())
     if epochs is not None:
         given += [f"level.epochs={epochs}", "transfer.epochs=1"]
     if seed is not None:
         given.append(f"seed={seed}")
-    with _progress(quiet=json) as report:
+    with progress(f"reading {dataset}", quiet=json) as shown:
         surrogate = train(
             dataset, output, model or None, config, given, preset=preset or None, test=test or None, device=device,
-            resume=resume, overwrite=overwrite, tensorboard=tensorboard, report=report,
+            resume=resume, overwrite=overwrite, tensorboard=tensorboard, report=epoch_lines(shown, verbose),
         )  # fmt: skip
-    _show(surrogate, output, json)
+    if json:
+        print_json(_as_json(surrogate, output))
+        return
+    show(surrogate, output)
+    if interrupted(surrogate):
+        say("interrupted: the best weights so far are stored; continue with --resume --overwrite")
+    elif surrogate.record.held_out_runs:
+        what_next(output / "card.md", ("evaluate", dataset, output, "-o", "report"))
+    else:
+        first = {n: f"{a:.4g}" for n, a in zip(surrogate.record.ranges.names, surrogate.record.ranges.low, strict=True)}
+        what_next(
+            output / "card.md", ("predict", output, *(x for n, a in first.items() for x in ("--param", f"{n}={a}")))
+        )
 
 
-@contextlib.contextmanager
-def _progress(quiet: bool) -> Iterator[Callable[[Epoch], None]]:
-    """A bar a level on a terminal, ten lines a level elsewhere."""
-    with progress(quiet=quiet) as bar:
-        tasks: dict[str, Any] = {}
+def epoch_lines(shown: Progress, verbose: bool = False) -> Callable[[Epoch], None]:
+    """Reports of epochs as lines of progress."""
 
-        def report(epoch: Epoch) -> None:
-            if epoch.name not in tasks:
-                tasks[epoch.name] = bar.add_task(epoch.name, total=epoch.epochs, note="")
+    def report(epoch: Epoch) -> None:
+        if epoch.validation_error == epoch.validation_error:
             note = (
-                f"total {epoch.total:.3e} = approximation {epoch.approximation:.3e} + reconstruction "
-                f"{epoch.reconstruction:.3e}, validation {epoch.validation:.3e} (best in epoch {epoch.best_epoch}), "
+                f"validation {100 * epoch.validation_error:.2f} cm "
+                f"(best {100 * epoch.best_error:.2f}, epoch {epoch.best_epoch})"
+            )
+        else:
+            note = f"training loss {epoch.total:.2e}, no validation runs"
+        if verbose:
+            note += (
+                f" | total {epoch.total:.3e} = approximation {epoch.approximation:.3e} + reconstruction "
+                f"{epoch.reconstruction:.3e}, validation {epoch.validation:.3e}, rate {epoch.learning_rate:.1e}, "
                 f"{epoch.rate:.1f} epochs/s"
             )
-            bar.update(tasks[epoch.name], completed=epoch.epoch, note=note)
-            every = max(1, epoch.epochs // 10)
-            if bar.disable and not quiet and (epoch.epoch % every == 0 or epoch.epoch == epoch.epochs):
-                say(f"{epoch.name} {epoch.epoch}/{epoch.epochs}  {note}, {epoch.seconds_left:.0f} s left")
+        shown.step(epoch.name, epoch.epoch, epoch.epochs, note, left=epoch.seconds_left)
 
-        yield report
+    return report
 
 
-def _show(surrogate: Surrogate, output: Path, as_json: bool) -> None:
-    """What was trained and how well it does on validation runs."""
-    record = surrogate.record
-    rows = [
+def _levels(surrogate: Surrogate) -> list[dict[str, object]]:
+    return [
         {
             "model": name,
             "level": number,
@@ -88,40 +103,39 @@ def _show(surrogate: Surrogate, output: Path, as_json: bool) -> None:
             "best_epoch": fit.best_epoch,
             "seconds": round(fit.seconds, 2),
             "status": fit.status,
-            "validation_error_m": record.errors.get(name),
+            "validation_error_m": surrogate.record.errors.get(name),
         }
         for name, number in surrogate.level_names.items()
         if (fit := surrogate.fit(number)) is not None
     ]
-    if as_json:
-        print_json(
-            {
-                "output": output, "levels": rows, "choice": record.choice, "validation_errors_m": record.errors,
-                "training_runs": record.fitted_runs, "validation_runs": record.validation_runs,
-                "held_out_runs": record.held_out_runs, "notes": record.notes,
-            }
-        )  # fmt: skip
-        return
-    for line in record.notes:
-        say(f"note: {line}")
+
+
+def _as_json(surrogate: Surrogate, output: Path) -> dict[str, object]:
+    record = surrogate.record
+    return {
+        "output": output, "levels": _levels(surrogate), "choice": record.choice, "validation_errors_m": record.errors,
+        "training_runs": record.fitted_runs, "validation_runs": record.validation_runs,
+        "held_out_runs": record.held_out_runs, "notes": record.notes,
+    }  # fmt: skip
+
+
+def show(surrogate: Surrogate, output: Path) -> None:
+    """What was trained and how well it does on validation runs."""
+    record = surrogate.record
+    for text in record.notes:
+        say(f"note: {text}")
     table(
         f"{output}: {len(record.fitted_runs)} training, {len(record.validation_runs)} validation, "
         f"{len(record.held_out_runs)} held-out runs",
         ("model", "nodes", "parameters", "epochs", "best", "training (s)", "validation error (cm)"),
         (
             (
-                r["model"],
-                r["nodes"],
-                r["parameters"],
-                r["epochs"] or "-",
-                r["best_epoch"] or "-",
+                r["model"], r["nodes"], r["parameters"], r["epochs"] or "-", r["best_epoch"] or "-",
                 f"{r['seconds']:.1f}",
-                "-" if r["validation_error_m"] is None else f"{100 * r['validation_error_m']:.2f}",
+                "-" if r["validation_error_m"] is None else f"{100 * float(str(r['validation_error_m'])):.2f}",
             )
-            for r in rows
+            for r in _levels(surrogate)
         ),
-    )
+    )  # fmt: skip
     if record.choice:
         say("chosen on validation runs: " + ", ".join(f"{k} {v}" for k, v in record.choice.items()))
-    if interrupted(surrogate):
-        say("interrupted: the best weights so far are stored; --resume --overwrite goes on from here")

@@ -7,21 +7,27 @@ from typing import Annotated
 
 import typer
 
-from crashkit.cli._console import print_json, say
+from crashkit.cli._console import print_json, progress, say
 
 
 def command(
     path: Annotated[Path, typer.Argument(help="Dataset (.zarr or .nc).", show_default=False)],
-    quick: Annotated[bool, typer.Option("--quick", help="Names, dimensions, units and attributes only.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Check names, dimensions, units and attributes, not the values.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the violations as JSON.")] = False,
 ) -> None:
-    """Check a dataset against the schema and its checksums, and list every violation; exit code 1 if there is any."""
+    """Check a dataset against the schema and its checksums; list what is wrong and exit with 1 if anything is."""
     from dataclasses import asdict
 
     from crashkit.dataset import open_dataset, reading
     from data_schema import validate
 
-    with open_dataset(path, chunks=None) as dataset, reading(path):
+    with (
+        progress(f"checking {path}", quiet=as_json),
+        open_dataset(path, chunks=None) as dataset,
+        reading(path),
+    ):
         violations = validate(dataset, values=not quick)
     if as_json:
         print_json({"path": path, "valid": not violations, "violations": [asdict(v) for v in violations]})

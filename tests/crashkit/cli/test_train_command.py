@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import warnings
 from pathlib import Path
 
@@ -130,11 +131,18 @@ def of_level(u: np.ndarray):  # type: ignore[no-untyped-def]
     return lambda level: u if level == 0 else u[:, :, plate.levels()[level - 1].kept]
 
 
-def test_progress_names_epoch_losses_rate_and_time_left(crash: Path, tmp_path: Path) -> None:
+def test_progress_is_in_centimetres_and_fits_eighty_columns(crash: Path, tmp_path: Path) -> None:
     code, _, err = run("train", crash, "-o", tmp_path / "m", "--model", "podnn", "--epochs", 2, "--test", "8:10")
     assert code == 0
     line = next(line for line in err.splitlines() if line.startswith("PODNN 2/2"))
-    for word in ("total", "approximation", "reconstruction", "validation", "epochs/s", "s left"):
+    assert re.fullmatch(r"PODNN 2/2 \| validation \d+\.\d\d cm \(best \d+\.\d\d, epoch [12]\)", line)
+    assert len(line) <= 80
+
+
+def test_losses_are_shown_when_asked(crash: Path, tmp_path: Path) -> None:
+    _, _, err = run("train", crash, "-o", tmp_path / "m", "--model", "podnn", "--epochs", 2, "--test", "8:10", "-v")
+    line = next(line for line in err.splitlines() if line.startswith("PODNN 2/2"))
+    for word in ("total", "approximation", "reconstruction", "validation", "rate", "epochs/s"):
         assert word in line
 
 

@@ -32,7 +32,7 @@ def test_levels_are_stored_and_told_with_their_lifting_errors(path: Path) -> Non
     code, out, _ = run(path, "--nodes", "120,30")
     assert code == 0
     assert [level.n_nodes for level in read_hierarchy(path).levels] == [120, 30]
-    assert "lifting error" in out.replace("\n", " ")
+    assert "interpolation" in out.replace("\n", " ")
 
 
 def test_the_default_keeps_an_eighth_a_quarter_and_a_quarter(path: Path) -> None:

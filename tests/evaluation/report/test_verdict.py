@@ -90,6 +90,17 @@ def test_a_large_relative_error_is_called_out(evaluation):
     assert "Relative displacement error" in _said(evaluation, "Large relative error")[0].text
 
 
+@pytest.mark.parametrize(("relative", "said"), [(0.16, "no model: even the best"), (0.14, "PODNN: ")])
+def test_nothing_is_recommended_for_optimisation_above_fifteen_percent(evaluation, relative, said):
+    best = _with_errors(evaluation, PODNN=[0.001] * 3)
+    scores = {
+        label: replace(s, relative=np.full_like(s.relative, relative if label == "PODNN" else 0.5))
+        for label, s in best.scores.items()
+    }
+    (statement,) = _said(replace(best, scores=scores), "Many queries (optimisation, uncertainty)")
+    assert statement.text.startswith(said)
+
+
 def test_the_interval_is_that_of_paired_differences():
     rng = np.random.default_rng(0)
     hard = rng.uniform(1, 9, 40)  # runs differ much more than models

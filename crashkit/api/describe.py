@@ -1,0 +1,164 @@
+"""What an engineer asks first about a dataset, a model folder or a report, as plain values in SI units."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from surrogates.surrogate import Surrogate
+
+
+def describe_dataset(dataset: xr.Dataset, path: Path) -> dict[str, Any]:
+    """The facts about the dataset at `path` in SI units; reads the displacements once, block by block.
+
+    Raises ReadError if values cannot be read.
+    """
+    from data_schema import fields, parameters, table_unit
+
+    size = dataset.sizes
+    part_faces = _counts(dataset, "face_part")
+    part_cells = _counts(dataset, "cell_part")
+    known = dataset.attrs
+    return {
+        "path": path,
+        "bytes_on_disk": _bytes(path),
+        "title": known.get("title"),
+        "solver": known.get("solver"),
+        "units_read": known.get("units_read"),
+        "runs": size["sim"],
+        "incomplete_runs": [str(n) for n in dataset["sim"].values[~dataset["complete"].values]] if "complete" in dataset else [],
+        "states": size["time"],
+        "time_begin": float(dataset["time"].values[0]),
+        "time_end": float(dataset["time"].values[-1]),
+        "alignment_error": float(dataset["alignment_error"].max()) if "alignment_error" in dataset else None,
+        "nodes": size["node"],
+        "faces": size["face"],
+        "cells": size.get("cell", 0),
+        "one_shape": "sim" not in dataset["reference_position"].dims,
+        "parts": [
+            {"id": int(number), "name": str(name), "faces": part_faces[k], "cells": part_cells[k]}
+            for k, (number, name) in enumerate(zip(dataset["part_id"].values, dataset["part_name"].values, strict=True))
+        ],
+        "parameters": [
+            {
+                "name": name,
+                "units": str(dataset[name].attrs.get("units", "")),
+                "table_units": table_unit(dataset, name)[0],
+                "table_factor": table_unit(dataset, name)[1],
+                "min": float(dataset[name].min()),
+                "max": float(dataset[name].max()),
+            }
+            for name in parameters(dataset)
+        ],
+        "fields": [
+            {"name": name, "on": str(dataset[name].dims[2]), "units": str(dataset[name].attrs.get("units", ""))}
+            for name in fields(dataset)
+        ],
+        "erodes": "alive" in dataset or "cell_alive" in dataset,
+        "largest_displacement": _largest(dataset),
+        "checksum": known.get("checksum"),
+        "levels": _levels(path),
+    }  # fmt: skip
+
+
+def _counts(dataset: xr.Dataset, name: str) -> list[int]:
+    import numpy as np
+
+    owners = dataset[name].values if name in dataset else np.empty(0, int)
+    return [int(n) for n in np.bincount(owners, minlength=dataset.sizes["part"])]
+
+
+def _largest(dataset: xr.Dataset) -> dict[str, Any]:
+    """The largest displacement of all: value (m), run, time (s), node_id; an empty dictionary if none is a number."""
+    import numpy as np
+
+    from data_schema.checksum import result_blocks
+
+    best: dict[str, Any] = {}
+    for k, run in enumerate(dataset["sim"].values):
+        for first, _, u in result_blocks(dataset["displacement"].isel(sim=k)):
+            squared = np.nan_to_num(np.einsum("tnx,tnx->tn", u, u), nan=-1.0)
+            state, node = (int(i) for i in np.unravel_index(int(squared.argmax()), squared.shape))
+            value = float(squared[state, node])
+            if value >= 0 and value**0.5 > best.get("value", -1.0):
+                best = {
+                    "value": value**0.5,
+                    "run": str(run),
+                    "time": float(dataset["time"].values[state]),
+                    "node_id": int(dataset["node_id"].values[first + node]),
+                }
+    return best
+
+
+def _bytes(path: Path) -> int:
+    return sum(f.stat().st_size for f in path.rglob("*") if f.is_file()) if path.is_dir() else path.stat().st_size
+
+
+def _levels(path: Path) -> list[dict[str, Any]]:
+    from crashkit.mesh.store import has_hierarchy, summarize_hierarchy
+
+    return list(summarize_hierarchy(path)) if has_hierarchy(path) else []
+
+
+def describe_model(surrogate: Surrogate, path: Path) -> dict[str, Any]:
+    """The facts about the model stored in the folder `path`."""
+    record = surrogate.record
+    ranges = record.ranges
+    spans = zip(ranges.names, ranges.units, ranges.written, ranges.low, ranges.high, strict=True)
+    return {
+        "path": path,
+        "bytes_on_disk": _bytes(path),
+        "kind": surrogate.settings.model,
+        "preset": surrogate.settings.preset,
+        "created": record.created,
+        "seed": record.seed,
+        "crashkit_version": record.versions.get("crashkit"),
+        "checksum": record.checksum,
+        **{key: str(value) for key, value in record.attributes.items()},
+        "training_runs": list(record.fitted_runs),
+        "validation_runs": list(record.validation_runs),
+        "held_out_runs": list(record.held_out_runs),
+        "nodes": surrogate.graphs.n_nodes(0),
+        "states": len(record.time),
+        "time_begin": ranges.time[0],
+        "time_end": ranges.time[1],
+        "parameters": [
+            {"name": n, "units": u, "table_units": t, "table_factor": f, "min": float(a), "max": float(b)}
+            for n, u, (t, f), a, b in spans
+        ],
+        "levels": [
+            {
+                "model": name,
+                "level": number,
+                "nodes": surrogate.graphs.n_nodes(number),
+                "latent": surrogate.n_latent(number),
+                "parameters": surrogate.n_parameters(number),
+                "validation_error": record.errors.get(name),
+                "validation_error_full": record.errors.get(f"{name}, lifted to the full mesh", record.errors.get(name)),
+                "has_band": surrogate.has_band(number),
+            }
+            for name, number in surrogate.level_names.items()
+        ],
+        "choice": record.choice,
+        "notes": list(record.notes),
+    }
+
+
+def describe_report(path: Path) -> dict[str, Any]:
+    """What stands in the report folder `path`: its own `report.json`. Raises ReadError where that is damaged."""
+    from crashkit.errors import ReadError
+
+    file = path / "report.json"
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+        if not isinstance(found, dict) or not isinstance(found.get("performance"), list):
+            raise ValueError("no table of performance")
+    except (OSError, ValueError, RecursionError) as error:
+        raise ReadError(
+            f"{file}: cannot be read as a report ({error}); make it again with crashkit evaluate"
+        ) from error
+    return {"path": path, **found}

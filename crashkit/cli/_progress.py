@@ -1,0 +1,152 @@
+"""Progress of long work: one live line on a terminal, lines in a log; never silent for more than five seconds.
+
+All commands tell their progress in one shape, `step(what, done, total, note)`, shown as
+
+    MH3 120/300 | validation 1.65 cm (best 1.65, epoch 21) | 38 s left
+
+The rooms below the command line say what they are at through `logging` (level INFO), so that none of them needs to know
+who listens; such a line becomes the `what` of the work that follows.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+import threading
+import time
+from types import TracebackType
+from typing import Any
+
+_ROOMS = ("crashkit", "surrogates", "evaluation")
+SILENCE = 4.5  # seconds without a line, after which one says that the work goes on
+_BETWEEN = 4.0  # seconds between two lines where there is no terminal
+
+
+def line(what: str, done: int, total: int, note: str, left: float | None) -> str:
+    """One line of progress."""
+    count = f" {done}/{total}" if total else f" {done}" if done else ""
+    pieces = [what + count, note, _left(left) if left is not None and done < total else ""]
+    return " | ".join(piece for piece in pieces if piece)
+
+
+def _left(seconds: float) -> str:
+    return f"{seconds:.0f} s left" if seconds < 120 else f"{seconds / 60:.0f} min left"
+
+
+class Progress:
+    """Shows what is being done; a context.
+
+    quiet  show nothing, as with --json
+    """
+
+    def __init__(self, what: str, quiet: bool = False) -> None:
+        self._quiet = quiet
+        self._live = not quiet and sys.stderr.isatty()
+        self._lock = threading.RLock()
+        self._now = what
+        self._text = what
+        self._begun: dict[str, tuple[float, int]] = {}
+        self._said = ""
+        self._last = self._since = time.monotonic()
+        self._end = threading.Event()
+        self._shown: Any = None
+
+    def __enter__(self) -> Progress:
+        if self._quiet:
+            return self
+        self._handler = _Listener(self)
+        for name in _ROOMS:
+            logger = logging.getLogger(name)
+            logger.addHandler(self._handler)
+            if logger.getEffectiveLevel() > logging.INFO:
+                logger.setLevel(logging.INFO)
+        if self._live:
+            from rich.status import Status
+
+            from crashkit.cli._console import console
+
+            self._shown = Status(self._now, console=console(stderr=True))
+            self._shown.start()
+        threading.Thread(target=self._watch, daemon=True).start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if self._quiet:
+            return
+        self._end.set()
+        for name in _ROOMS:
+            logging.getLogger(name).removeHandler(self._handler)
+        if self._shown is not None:
+            self._shown.stop()
+
+    def stage(self, what: str) -> None:
+        """From now on `what` is being done, and nothing is counted."""
+        self._tell(what, what, finished=False)
+
+    def step(self, what: str, done: int = 0, total: int = 0, note: str = "", left: float | None = None) -> None:
+        """`done` of `total` steps (0: unknown) of `what` are done; seconds left are estimated unless given."""
+        begun, first = self._begun.setdefault(what, (time.monotonic(), done))
+        if left is None and total and done > first:
+            left = (time.monotonic() - begun) / (done - first) * (total - done)
+        self._tell(what, line(what, done, total, note, left), finished=bool(total) and done >= total)
+
+    def say(self, text: str) -> None:
+        """A line that stays."""
+        if not self._quiet:
+            with self._lock:
+                self._print(text)
+
+    def _tell(self, what: str, text: str, finished: bool) -> None:
+        if self._quiet:
+            return
+        with self._lock:
+            now = time.monotonic()
+            if what != self._now:
+                self._now, self._since = what, now
+            self._text = text
+            if self._shown is not None:
+                self._shown.update(_fitted(text))
+            if (finished and text != self._said) or (not self._live and now - self._last >= _BETWEEN):
+                self._print(text)
+
+    def _print(self, text: str) -> None:
+        from crashkit.cli._console import say
+
+        self._said, self._last = text, time.monotonic()
+        if self._shown is not None:
+            self._shown.console.print(_fitted(text))
+        else:
+            say(text)
+
+    def _watch(self) -> None:
+        """Say that the work goes on where nothing else was said for a while."""
+        while not self._end.wait(0.25):
+            with self._lock:
+                now = time.monotonic()
+                seconds = now - self._since
+                if self._shown is not None and seconds > 1:
+                    self._shown.update(_fitted(f"{self._text} ({seconds:.0f} s)"))
+                elif self._shown is None and now - self._last >= SILENCE:
+                    self._print(f"{self._text} ... {seconds:.0f} s")
+
+
+def _fitted(text: str) -> Any:
+    """`text` for one line of a terminal: never wrapped, never read as markup."""
+    from rich.text import Text
+
+    return Text(text, no_wrap=True, overflow="ellipsis")
+
+
+class _Listener(logging.Handler):
+    """Turns what the rooms log into stages (INFO) and lines (WARNING and above)."""
+
+    def __init__(self, progress: Progress) -> None:
+        super().__init__(logging.INFO)
+        self._progress = progress
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = " ".join(record.getMessage().split())
+        if record.levelno >= logging.WARNING:
+            self._progress.say(f"warning: {text}")
+        else:
+            self._progress.stage(text)
