@@ -16,7 +16,7 @@ def refuse_earlier(output: Path, mark: str, what: str, option: str = "-o") -> No
     """Raise OutputError where `output` holds an earlier result, known by its file `mark`, that nobody asked to replace."""
     if (output / mark).exists():
         raise OutputError(
-            f"{output}: holds a {what} already; replace it with --overwrite, or choose another place with -o"
+            f"{output}: holds a {what} already; replace it with --overwrite, or choose another place with {option}"
         )
 
 
