@@ -1,4 +1,4 @@
-"""What all commands share: the two consoles, progress, JSON output, failing, and what to look at next."""
+"""What all commands share: the two consoles, JSON output, failing, and what to look at next."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import json
 import math
 import shlex
 import sys
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -15,8 +14,6 @@ import typer
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-    from crashkit.cli._progress import Progress
 
 
 def console(stderr: bool = False) -> Console:
@@ -63,15 +60,6 @@ def _plain(value: Any) -> Any:
     if value is None or isinstance(value, (str, int, float, bool)):
         return value
     return str(value)
-
-
-@contextmanager
-def progress(what: str, quiet: bool = False) -> Iterator[Progress]:
-    """Progress on stderr, beginning with `what` is being done: a live line on a terminal, else a line now and then."""
-    from crashkit.cli._progress import Progress
-
-    with Progress(what, quiet=quiet) as shown:
-        yield shown
 
 
 def table(title: str, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> None:

@@ -17,6 +17,8 @@ import time
 from types import TracebackType
 from typing import Any
 
+from crashkit.cli._console import console, say
+
 _ROOMS = ("crashkit", "surrogates", "evaluation")
 SILENCE = 4.5  # seconds without a line, after which one says that the work goes on
 _BETWEEN = 4.0  # seconds between two lines where there is no terminal
@@ -63,8 +65,6 @@ class Progress:
         if self._live:
             from rich.status import Status
 
-            from crashkit.cli._console import console
-
             self._shown = Status(self._now, console=console(stderr=True))
             self._shown.start()
         threading.Thread(target=self._watch, daemon=True).start()
@@ -110,8 +110,6 @@ class Progress:
                 self._print(text)
 
     def _print(self, text: str) -> None:
-        from crashkit.cli._console import say
-
         self._said, self._last = text, time.monotonic()
         if self._shown is not None:
             self._shown.console.print(_fitted(text))

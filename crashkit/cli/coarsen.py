@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from crashkit.api.coarsen import coarsen
-from crashkit.cli._console import numbers, print_json, progress, say, table, what_next
+from crashkit.cli._console import numbers, print_json, say, table, what_next
+from crashkit.cli._progress import Progress
 from evaluation.drawing.levels import draw_levels
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ def command(
     factors = numbers(ratios, "--ratios", "8,4,4")
     if counts and factors:
         raise typer.BadParameter("give either --nodes or --ratios", param_hint="--ratios")
-    with progress(f"selecting the nodes of {path}", quiet=json) as shown:
+    with Progress(f"selecting the nodes of {path}", quiet=json) as shown:
         hierarchy = coarsen(
             path,
             counts or None,

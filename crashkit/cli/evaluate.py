@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from crashkit.api.evaluate import evaluate
-from crashkit.cli._console import fail, print_json, progress, say, table, what_next
+from crashkit.cli._console import fail, print_json, say, table, what_next
+from crashkit.cli._progress import Progress
 
 if TYPE_CHECKING:
     from evaluation.comparison.result import Evaluation
@@ -54,7 +55,7 @@ def command(
     from crashkit.dataset import open_dataset
     from evaluation.report.tables import performance
 
-    with progress(f"reading {dataset}", quiet=as_json) as shown:
+    with Progress(f"reading {dataset}", quiet=as_json) as shown:
         names: tuple[str, ...] = ()
         if test or vtk_runs:
             with open_dataset(dataset, chunks=None) as opened:

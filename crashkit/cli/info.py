@@ -8,7 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from crashkit.cli._console import console, print_json, progress, table, what_next
+from crashkit.cli._console import console, print_json, table, what_next
+from crashkit.cli._progress import Progress
 
 # How values of these units are shown to people: factor and unit. JSON keeps SI.
 _SHOWN = {"Pa": (1e-6, "MPa"), "s": (1e3, "ms"), "m": (1e3, "mm")}
@@ -37,7 +38,7 @@ def command(
         from crashkit.api.describe import describe_model
         from crashkit.api.predict import load_model
 
-        with progress(f"reading {path}", quiet=as_json):
+        with Progress(f"reading {path}", quiet=as_json):
             found = describe_model(load_model(path), path)
         print_json(found) if as_json else _print_model(found)
     elif (path / "report.json").exists():
@@ -57,7 +58,7 @@ def _dataset(path: Path, report: Path | None, overwrite: bool, quiet: bool) -> d
     from crashkit.dataset import open_dataset, reading
 
     with (
-        progress(f"reading {path}", quiet=quiet) as shown,
+        Progress(f"reading {path}", quiet=quiet) as shown,
         open_dataset(path, chunks=None) as dataset,
         reading(path),
     ):

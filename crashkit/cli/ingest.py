@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from crashkit.cli._console import fail, names, print_json, progress, say, table, what_next
+from crashkit.cli._console import fail, names, print_json, say, table, what_next
+from crashkit.cli._progress import Progress
 
 if TYPE_CHECKING:
     from crashkit.ingestion.ingest import IngestSummary
@@ -70,7 +71,7 @@ def command(
 
     if on_error not in ("stop", "skip"):
         raise typer.BadParameter(f"{on_error!r}; expected stop or skip", param_hint="--on-error")
-    with progress("looking for runs", quiet=json) as shown:
+    with Progress("looking for runs", quiet=json) as shown:
         try:
             summary = ingest(
                 sources, output, params=params, units=units, reader=reader, mesh=mesh, time_step=time_step,

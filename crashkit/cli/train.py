@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from crashkit.api.train import interrupted, train
-from crashkit.cli._console import print_json, progress, say, table, what_next
+from crashkit.cli._console import print_json, say, table, what_next
+from crashkit.cli._progress import Progress
 
 if TYPE_CHECKING:
-    from crashkit.cli._progress import Progress
     from surrogates.surrogate import Surrogate
     from surrogates.training.loop import Epoch
 
@@ -50,7 +50,7 @@ def command(
         given += [f"level.epochs={epochs}", "transfer.epochs=1"]
     if seed is not None:
         given.append(f"seed={seed}")
-    with progress(f"reading {dataset}", quiet=json) as shown:
+    with Progress(f"reading {dataset}", quiet=json) as shown:
         surrogate = train(
             dataset, output, model or None, config, given, preset=preset or None, test=test or None, device=device,
             resume=resume, overwrite=overwrite, tensorboard=tensorboard, report=epoch_lines(shown, verbose),

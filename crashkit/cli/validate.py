@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from crashkit.cli._console import print_json, progress, say
+from crashkit.cli._console import print_json, say
+from crashkit.cli._progress import Progress
 
 
 def command(
@@ -24,7 +25,7 @@ def command(
     from data_schema import validate
 
     with (
-        progress(f"checking {path}", quiet=as_json),
+        Progress(f"checking {path}", quiet=as_json),
         open_dataset(path, chunks=None) as dataset,
         reading(path),
     ):
