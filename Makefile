@@ -21,7 +21,7 @@ check: $(READY)
 	$(BIN)/lint-imports --no-cache
 
 # Installed again only when what is to be installed has changed.
-$(READY): pyproject.toml constraints.txt tools/make_environment.py $(wildcard surrogates/*/*.c surrogates/*.c)
+$(READY): pyproject.toml constraints.txt tools/make_environment.py
 	@$(PYTHON) tools/make_environment.py $(VENV)
 	@touch $@
 

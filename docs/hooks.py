@@ -10,13 +10,20 @@ HERE = Path(__file__).parent
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Replace `<!-- schema: dimensions|variables|attributes -->` and `<!-- table: FILE -->` by tables."""
+    """Replace `<!-- schema: dimensions|variables|attributes -->`, `<!-- table: FILE -->` and `<!-- project: FILE -->`."""
+    markdown = re.sub(r"<!-- project: (\S+) -->", lambda found: _project_file(found[1]), markdown)
     markdown = re.sub(r"<!-- table: (\S+) -->", lambda found: (HERE / found[1]).read_text(encoding="utf-8"), markdown)
     for name, make in (("dimensions", _dimensions), ("variables", _variables), ("attributes", _attributes)):
         marker = f"<!-- schema: {name} -->"
         if marker in markdown:
             markdown = markdown.replace(marker, make())
     return markdown
+
+
+def _project_file(name: str) -> str:
+    """A page of the project's root, with its links as they are from within `docs`."""
+    text = (HERE.parent / name).read_text(encoding="utf-8")
+    return text.replace("](docs/", "](").replace("](CONTRIBUTING.md)", "](contributing.md)")
 
 
 def on_page_content(html: str, **_: Any) -> str:
