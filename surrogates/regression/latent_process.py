@@ -9,8 +9,8 @@ Source of the kernel's numbers: `surrogates.regression.gaussian.Gaussian` (Rasmu
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Literal, Protocol
+from collections.abc import Mapping, Sequence
+from typing import Literal, Protocol
 
 import numpy as np
 import torch
@@ -18,9 +18,6 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from surrogates.regression.gaussian import Gaussian
-
-if TYPE_CHECKING:
-    from sklearn.gaussian_process.kernels import Kernel
 
 Wish = Literal["network", "process", "mean", "auto"]
 # Shares of the process to choose from; without validation runs the first one is taken.
@@ -34,7 +31,7 @@ class LatentProcess(nn.Module):
     runs      (run, parameter) scaled parameters of the training runs
     time      (state,) scaled, increasing
     mean      (state, latent) mean course, and `pull` (run, state, latent) what each run adds to it
-    numbers   variance, variance of the linear trend, its offset, then one length for each parameter
+    numbers   variance, variance of the linear trend, noise; `mix` (parameter, parameter), see `gaussian.Kernel`
     """
 
     runs: Tensor
@@ -42,6 +39,7 @@ class LatentProcess(nn.Module):
     mean: Tensor
     pull: Tensor
     numbers: Tensor
+    mix: Tensor
     share: Tensor
 
     def __init__(self, runs: int, parameters: int, states: int, latent: int) -> None:
@@ -51,7 +49,8 @@ class LatentProcess(nn.Module):
             ("time", (states,)),
             ("mean", (states, latent)),
             ("pull", (runs, states, latent)),
-            ("numbers", (3 + parameters,)),
+            ("numbers", (3,)),
+            ("mix", (parameters, parameters)),
             ("share", ()),
         ):
             self.register_buffer(name, torch.zeros(shape))
@@ -72,10 +71,10 @@ class LatentProcess(nn.Module):
 
     def _kernel(self, x: Tensor) -> Tensor:
         """(b, run): Matern 3/2 with a linear trend."""
-        variance, slope, offset, lengths = *self.numbers[:3], self.numbers[3:]
-        apart = ((x[:, None] - self.runs) / lengths).square().sum(dim=2)
+        apart = ((x[:, None] - self.runs) @ self.mix.T).square().sum(dim=2)
         distance = math.sqrt(3.0) * torch.sqrt(apart + 1e-12)
-        return variance * (1.0 + distance) * torch.exp(-distance) + slope * (offset.square() + x @ self.runs.T)
+        matern = self.numbers[0] * (1.0 + distance) * torch.exp(-distance)
+        return matern + self.numbers[1] * (x @ self.runs.T)
 
     def _stencil(self, time: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor, Tensor]]:
         """Interval (b,) of each time, and the weights (b,) of the states -1, 0, 1, 2 from its start.
@@ -117,18 +116,22 @@ def fit_process(
     courses: NDArray[np.float64],
     sizes: NDArray[np.float64],
     seed: int,
+    mixed: Sequence[int] = (),
 ) -> LatentProcess:
     """A process fitted to the courses (run, state, latent) of training runs with scaled parameters (run, parameter).
 
     time   (state,) scaled
     sizes  (latent,) how far the displacements move with each latent number: what counts in the kernel's likelihood
+    mixed  parameters whose lengths form a full matrix, see `gaussian.Gaussian`
     """
-    mean = courses.mean(axis=0)
-    machine = Gaussian(runs).fit((courses * sizes).reshape(len(runs), -1), seed)
-    kernel = machine.kernel()
-    pull = np.linalg.solve(kernel(runs), (courses - mean).reshape(len(runs), -1)).reshape(courses.shape)
+    machine = Gaussian(runs, mixed=mixed).fit((courses * sizes).reshape(len(runs), -1), seed)
+    mean, pull = machine.expanded(courses.reshape(len(runs), -1))
+    kernel = machine.kernel
     out = LatentProcess(len(runs), runs.shape[1], len(time), courses.shape[2])
-    named = {"runs": runs, "time": time, "mean": mean, "pull": pull, "numbers": _numbers(kernel)}
+    named = {
+        "runs": runs, "time": time, "mean": mean.reshape(courses.shape[1:]), "pull": pull.reshape(courses.shape),
+        "numbers": kernel.numbers, "mix": kernel.mix,
+    }  # fmt: skip
     for name, values in named.items():
         getattr(out, name).copy_(torch.from_numpy(np.asarray(values, np.float64)))
     return out
@@ -182,14 +185,3 @@ def mix_in(level: HasProcess, judge: Judge, wish: Wish, parameters: int, states:
     process.share.fill_(best)
     if best == 0:
         level.process = None
-
-
-def _numbers(kernel: Kernel) -> NDArray[np.float64]:
-    """variance, slope, offset, lengths of c Matern + s DotProduct + noise."""
-    values = {name: value for name, value in kernel.get_params().items() if not name.endswith("bounds")}
-    return np.concatenate(
-        [
-            [values["k1__k1__k1__constant_value"], values["k1__k2__k1__constant_value"], values["k1__k2__k2__sigma_0"]],
-            np.atleast_1d(values["k1__k1__k2__length_scale"]),
-        ]
-    )
