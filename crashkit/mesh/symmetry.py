@@ -1,0 +1,220 @@
+"""Mirror planes of a mesh, and the probe map that says what a mirrored field is at every node.
+
+A structure can be symmetric in shape although its mesh is not: a mirrored node then lands between other nodes, and takes
+the barycentric weights of the closest point of the mesh there, as in `crashkit.mesh.probe`. Parts go over into parts
+(the left box into the right one), so that sheets that touch are not mixed up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import sparse
+from scipy.spatial import cKDTree
+
+from crashkit.mesh import _closest
+from crashkit.mesh.probe import cells_of_nodes, closest_cells, coarse_cells
+from crashkit.mesh.surface import Surface, surface
+
+# A plane counts as one where mirrored nodes lie this close to the surface, in mean edge lengths: on average, and but
+# for one node in a hundred.
+MEAN_WITHIN = 0.25
+MOST_WITHIN = 1.5
+# Nodes by which planes are compared while they are sought.
+_SEEN = 2000
+_ROUNDS = 12
+# Cosine above which two normals are the same direction.
+_ALIKE = 0.999
+
+
+@dataclass(frozen=True)
+class MirrorPlane:
+    """A plane in which the mesh is (nearly) its own image, and the map of fields.
+
+    normal  (3,), of length 1, its largest component positive; offset, m: the plane is normal . x = offset
+    to_image  (n, n): row i holds the weights with which the field at the mirror image of node i is put together
+    mean, most, largest  distance, m, of mirrored nodes from the surface: mean, 99 of 100, largest
+    edge    mean edge length, m
+    """
+
+    normal: NDArray[np.float64]
+    offset: float
+    to_image: sparse.csr_matrix
+    mean: float
+    most: float
+    largest: float
+    edge: float
+
+    @property
+    def reflection(self) -> NDArray[np.float64]:
+        """(3, 3): what a vector becomes in the mirror."""
+        return reflection(self.normal)
+
+    @property
+    def name(self) -> str:
+        """Such as "y = 0.012 m", or the normal where the plane is askew."""
+        axis = int(np.abs(self.normal).argmax())
+        if self.normal[axis] > 1 - 1e-9:
+            return f"{'xyz'[axis]} = {round(self.offset, 4) + 0.0:g} m"
+        return f"({', '.join(f'{c:.3f}' for c in self.normal)}) . x = {self.offset:.4g} m"
+
+    def told(self) -> str:
+        """One sentence on how well the mesh fits its image."""
+        return (
+            f"mirror plane {self.name}: mirrored nodes lie {1e3 * self.mean:.2g} mm from the surface on average, "
+            f"{1e3 * self.largest:.2g} mm at most (edges are {1e3 * self.edge:.2g} mm)"
+        )
+
+
+def mirror_planes(position: ArrayLike, face_nodes: ArrayLike, face_part: ArrayLike | None = None) -> list[MirrorPlane]:
+    """Planes in which the mesh is its own image within `MEAN_WITHIN` and `MOST_WITHIN` edges, the best first.
+
+    position    (n, 3), m; face_nodes (m, 3 or 4), -1 in the last corner of a triangle among quadrilaterals
+    face_part   (m,) part of each face, from 0
+
+    Sought along the axes and the principal axes of the surface; each plane is then moved and turned until mirrored
+    nodes lie closest to the nodes (an iterative closest point). Raises MeshError as `surface` does.
+    """
+    mesh = surface(position, face_nodes, face_part)
+    edge = float(np.linalg.norm(np.diff(mesh.position[mesh.edges], axis=1)[:, 0], axis=1).mean())
+    found: list[MirrorPlane] = []
+    for normal, offset in _candidates(mesh):
+        rough = _spread(mesh, normal, offset)
+        if rough > 2 * edge:
+            continue
+        plane = _plane(mesh, normal, offset, edge)
+        fits = plane.mean <= MEAN_WITHIN * edge and plane.most <= MOST_WITHIN * edge
+        if fits and not any(abs(plane.normal @ other.normal) > _ALIKE for other in found):
+            found.append(plane)
+    return sorted(found, key=lambda plane: plane.mean)
+
+
+def mirror_plane(
+    position: ArrayLike, face_nodes: ArrayLike, normal: ArrayLike, offset: float, face_part: ArrayLike | None = None
+) -> MirrorPlane:
+    """The plane normal . x = offset and its map, however well it fits. Raises MeshError as `surface` does."""
+    mesh = surface(position, face_nodes, face_part)
+    edge = float(np.linalg.norm(np.diff(mesh.position[mesh.edges], axis=1)[:, 0], axis=1).mean())
+    direction = np.asarray(normal, np.float64)
+    length = float(np.linalg.norm(direction))
+    return _plane(mesh, direction / length, float(offset) / length, edge)
+
+
+def reflection(normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3): the Householder matrix I - 2 n n^T."""
+    return np.eye(3) - 2 * np.outer(normal, normal)
+
+
+def _candidates(mesh: Surface) -> list[tuple[NDArray[np.float64], float]]:
+    """Normals and offsets: axes first, principal axes after, each as given and then as a closest-point search leaves it."""
+    corners = mesh.position[mesh.triangles]
+    twice = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    middle = corners.mean(axis=1)
+    centre = np.average(middle, axis=0, weights=twice)
+    spread = ((middle - centre) * twice[:, None]).T @ (middle - centre)
+    axes = [*np.eye(3), *np.linalg.eigh(spread)[1].T]
+    box = (mesh.position[mesh.used].min(axis=0) + mesh.position[mesh.used].max(axis=0)) / 2
+    out = []
+    for k, axis in enumerate(axes):
+        normal = axis * np.sign(axis[np.abs(axis).argmax()])
+        # Engineers put the plane of symmetry at zero; then the middle of the box, then the centre of the surface.
+        starts = [0.0, float(normal @ box), float(normal @ centre)]
+        spreads = [_spread(mesh, normal, start) for start in starts]
+        best = next(i for i in range(3) if spreads[i] <= 1.01 * min(spreads) + 1e-12)
+        moved = _settled(mesh, normal, starts[best], turn=k >= 3)
+        improved = _spread(mesh, *moved) < 0.98 * spreads[best]
+        out.append(moved if improved else (normal, starts[best]))
+    return out
+
+
+def _settled(
+    mesh: Surface, normal: NDArray[np.float64], offset: float, *, turn: bool
+) -> tuple[NDArray[np.float64], float]:
+    """The plane moved (and turned) so that nodes and the nodes closest to their images lie symmetric to it."""
+    at = _some(mesh)
+    tree = cKDTree(mesh.position[mesh.used])
+    nodes = mesh.position[mesh.used]
+    for _ in range(_ROUNDS):
+        apart, nearest = tree.query(_mirrored(at, normal, offset))
+        close = apart <= np.quantile(apart, 0.9)
+        one, other = at[close], nodes[nearest[close]]
+        if turn:
+            # The normal along which pairs differ most, and the middle of the pairs.
+            across = one - other
+            values, vectors = np.linalg.eigh(across.T @ across)
+            if values[-1] <= 0:
+                break
+            normal = vectors[:, -1] * np.sign(vectors[:, -1] @ normal)
+        offset = float(((one + other) / 2 @ normal).mean())
+    return normal, offset
+
+
+def _spread(mesh: Surface, normal: NDArray[np.float64], offset: float) -> float:
+    """Mean distance, m, of mirrored nodes to the closest node."""
+    tree = cKDTree(mesh.position[mesh.used])
+    return float(tree.query(_mirrored(_some(mesh), normal, offset))[0].mean())
+
+
+def _some(mesh: Surface) -> NDArray[np.float64]:
+    at = mesh.position[mesh.used]
+    return at[np.unique(np.linspace(0, len(at) - 1, _SEEN).astype(int))]
+
+
+def _mirrored(at: NDArray[np.float64], normal: NDArray[np.float64], offset: float) -> NDArray[np.float64]:
+    return at - 2 * (at @ normal - offset)[:, None] * normal
+
+
+def _plane(mesh: Surface, normal: NDArray[np.float64], offset: float, edge: float) -> MirrorPlane:
+    images = _mirrored(mesh.position, normal, offset)
+    cells = coarse_cells(mesh.triangles, mesh.part, mesh.edges, mesh.node_parts, mesh.n_parts)
+    sets = _image_parts(mesh, images)
+    candidate = closest_cells(images, sets, mesh.position, cells)
+    rows = np.flatnonzero(candidate >= 0)
+    columns, weights = np.zeros((mesh.n_nodes, 3), np.int64), np.zeros((mesh.n_nodes, 3))
+    weights[:, 0] = 1.0
+    columns[:, 0] = cKDTree(mesh.position).query(images)[1]
+    start, listed = cells_of_nodes(cells.nodes, mesh.n_nodes)
+    first = np.ascontiguousarray(cells.nodes[candidate[rows], 0])
+    none = np.zeros(mesh.n_nodes + 1, np.int64)
+    found, weight = _closest.settle(
+        images[rows], first, candidate[rows], mesh.position, cells.nodes, start, listed, none, none[:0], 0
+    )
+    columns[rows] = cells.nodes[found]
+    weights[rows] = weight
+    weights[weights < 1e-9] = 0.0
+    weights /= weights.sum(axis=1, keepdims=True)
+    here = weights > 0
+    row = np.broadcast_to(np.arange(mesh.n_nodes)[:, None], here.shape)[here]
+    u = sparse.csr_matrix((weights[here], (row, columns[here])), shape=(mesh.n_nodes, mesh.n_nodes))
+    u.sort_indices()
+    apart = np.linalg.norm(images - u @ mesh.position, axis=1)[mesh.used]
+    mean, most, largest = float(apart.mean()), float(np.quantile(apart, 0.99)), float(apart.max())
+    return MirrorPlane(normal, float(offset), u, mean, most, largest, edge)
+
+
+def _image_parts(mesh: Surface, images: NDArray[np.float64]) -> NDArray[np.uint64]:
+    """(n, words) bit sets of the parts on which the image of each node lies: a part's nodes go to the part closest to them."""
+    words = mesh.node_parts.shape[1]
+    out = np.zeros((mesh.n_nodes, words), np.uint64)
+    members = [
+        np.flatnonzero(mesh.node_parts[:, p // 64] >> np.uint64(p % 64) & np.uint64(1)) for p in range(mesh.n_parts)
+    ]
+    low = np.array([mesh.position[m].min(axis=0) if len(m) else np.full(3, np.inf) for m in members])
+    high = np.array([mesh.position[m].max(axis=0) if len(m) else np.full(3, -np.inf) for m in members])
+    trees: dict[int, cKDTree] = {}
+    for mine in members:
+        if not len(mine):
+            continue
+        at = images[mine]
+        # Parts whose box is closest to the box of the image; the nodes of a few decide.
+        apart = np.abs(low - at.min(axis=0)).sum(axis=1) + np.abs(high - at.max(axis=0)).sum(axis=1)
+        near = [int(q) for q in np.argsort(apart)[:6] if len(members[q])]
+        for q in near:
+            if q not in trees:
+                trees[q] = cKDTree(mesh.position[members[q]])
+        some = at[np.unique(np.linspace(0, len(at) - 1, 200).astype(int))]
+        best = min(near, key=lambda q: float(trees[q].query(some)[0].mean()))
+        out[mine, best // 64] |= np.uint64(1) << np.uint64(best % 64)
+    return out
