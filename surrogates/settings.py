@@ -109,14 +109,50 @@ class TransferSettings(_Frozen):
 class InputSettings(_Frozen):
     """What the regression sees beside the parameters and the time, each scaled to [-1, 1].
 
+    derived        what stands in for the parameters: off (themselves); auto (chosen by cross-validation among logarithms,
+                   a warped angle, monomials that the units allow, and a full matrix of lengths); or monomials such as
+                   impact_speed**2/yield_stress, one or a list
     products       each parameter times the time
     angles         sine and cosine of parameters in degree
     initial_state  the encoded first state of the run (z0)
     """
 
+    derived: Literal["auto", "off"] | tuple[str, ...] = "auto"
     products: bool = False
     angles: bool = False
     initial_state: bool = False
+
+    @field_validator("derived", mode="before")
+    @classmethod
+    def _listed(cls, value: Any) -> Any:
+        if value is False:  # YAML reads off as false
+            return "off"
+        if isinstance(value, str) and value not in ("auto", "off"):
+            return tuple(part.strip() for part in value.split(",") if part.strip())
+        return value
+
+
+class PhysicsSettings(_Frozen):
+    """What is known of a crash before the first run: see `surrogates.physics`.
+
+    clock     runs are put on one clock and size; auto: exponents by cross-validation where a parameter is a speed
+    symmetry  mirrored runs train as well; auto: where the mesh has a plane, and cross-validation agrees
+    odd       parameters that change their sign in the mirror, such as [impact_angle]; without, cross-validation proposes
+    """
+
+    clock: Literal["auto", "off"] = "auto"
+    symmetry: Literal["auto", "off"] = "auto"
+    odd: tuple[str, ...] | None = None
+
+    @field_validator("clock", "symmetry", mode="before")
+    @classmethod
+    def _off(cls, value: Any) -> Any:
+        return "off" if value is False else value
+
+    @field_validator("odd", mode="before")
+    @classmethod
+    def _some(cls, value: Any) -> Any:
+        return (value,) if isinstance(value, str) else value
 
 
 class ValidationSettings(_Frozen):
@@ -124,11 +160,13 @@ class ValidationSettings(_Frozen):
 
     measure  runs: on runs held out of the training runs; paper: on the training runs themselves
     share    of the training runs held out, drawn by the seed; `runs` names them instead
+    folds    parts of the training runs that are left out in turn, where choices are made by cross-validation
     """
 
     measure: Literal["runs", "paper"] = "runs"
     share: Annotated[float, Field(gt=0, lt=1)] = 1 / 8
     runs: tuple[str, ...] = ()
+    folds: Annotated[int, Field(ge=2)] = 6
 
 
 class RefinementSettings(_Frozen):
@@ -146,12 +184,13 @@ class RefinementSettings(_Frozen):
 class PodSettings(_Frozen):
     """POD with Gaussian processes or radial basis functions.
 
-    modes   numbers of modes to choose from on validation runs
-    inputs  trajectory: a whole run is one sample; point: parameters and time are the inputs; auto: validation decides
+    modes   numbers of modes to choose from by cross-validation
+    inputs  trajectory: a whole run is one sample; point: parameters and time are the inputs; auto: cross-validation
+            decides
     points  most samples of "point" that a Gaussian process is given
     """
 
-    modes: tuple[Positive, ...] = (2, 4, 8, 12, 16, 24, 32, 48)
+    modes: tuple[Positive, ...] = (2, 4, 8, 16, 32, 48, 64, 96)
     inputs: Literal["auto", "trajectory", "point"] = "auto"
     points: Positive = 800
 
@@ -175,6 +214,7 @@ class Settings(_Frozen):
     at: Mapping[int, Mapping[str, Any]] = {}
     transfer: TransferSettings = TransferSettings()
     inputs: InputSettings = InputSettings()
+    physics: PhysicsSettings = PhysicsSettings()
     validation: ValidationSettings = ValidationSettings()
     refinement: RefinementSettings = RefinementSettings()
     unified: bool = False
@@ -231,7 +271,11 @@ _FAST: dict[str, Any] = {
     },
     "transfer": {"upsampling": "sparse", "mlp": "residual", "epochs": 0.2},
 }
-_PAPER: dict[str, Any] = {"validation": {"measure": "paper"}}
+_PAPER: dict[str, Any] = {
+    "validation": {"measure": "paper"},
+    "inputs": {"derived": "off"},
+    "physics": {"clock": "off", "symmetry": "off"},
+}
 _PRESETS: Mapping[str, dict[str, Any]] = {"fast": _FAST, "paper": _PAPER}
 _OF_MODEL: Mapping[str, dict[str, Any]] = {
     "podnn": {"level": {"reduction": "pod", "start": "plain", "latent": 4, "regression": "network"}, "levels": [0]},

@@ -55,6 +55,21 @@ class Labels:
 
 
 @dataclass(frozen=True)
+class Mirror:
+    """A plane in which the structure is its own image, as arrays.
+
+    reflection  (3, 3): what a vector becomes in the mirror
+    to_image    (node, node) of the full mesh: row i holds the weights of the field at the mirror image of node i
+    told        what it is and how well the mesh fits its image, in a sentence; `name` in a word
+    """
+
+    reflection: NDArray[np.float64]
+    to_image: sparse.csr_matrix
+    name: str = "mirror plane"
+    told: str = ""
+
+
+@dataclass(frozen=True)
 class Campaign:
     """The runs a surrogate may see, and nothing of the test runs.
 
@@ -72,6 +87,9 @@ class Campaign:
     points, faces   the full mesh (node, 3), m, and (face, corner), stored with the model so that it draws without data
     labels          the solver's numbers and names on it
     table_units     for each parameter the unit people write it in, and its value in `parameter_units`: ("MPa", 1e6)
+    dimensions      exponents of (kg, m, s) of each parameter's unit, None where it has none that is known
+    mirrors         planes of symmetry of the structure, the best first
+    known           (sim, state) whether a run was computed that far; None: all were. Other states are in no loss
     """
 
     parameters: NDArray[np.float64]
@@ -90,3 +108,6 @@ class Campaign:
     faces: NDArray[np.int32] | None = None
     labels: Labels | None = None
     table_units: tuple[tuple[str, float], ...] = ()
+    dimensions: tuple[tuple[float, float, float] | None, ...] = ()
+    mirrors: tuple[Mirror, ...] = ()
+    known: NDArray[np.bool_] | None = None

@@ -96,6 +96,13 @@ def far_outside(ranges: Ranges, parameters: NDArray[np.float64], time: NDArray[n
     return out + (["time"] if time.min() < first - allowed or time.max() > last + allowed else [])
 
 
+def over_range(x: NDArray[np.float64], over: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(run, input) -> [-1, 1] over the range that `over` (run, input) spans, without the inputs that are constant there."""
+    low, high = over.min(axis=0), over.max(axis=0)
+    moves = high > low
+    return np.asarray(2 * (np.atleast_2d(x)[:, moves] - low[moves]) / (high - low)[moves] - 1)
+
+
 class InputScaling(nn.Module):
     """Parameters (b, p) and time (b,) -> (b, size) float32, each column in [-1, 1] over the training runs.
 

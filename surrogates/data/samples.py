@@ -95,6 +95,13 @@ def split(campaign: Campaign, settings: Settings, notes: Notes) -> Split:
     return Split(np.setdiff1d(everything, chosen), chosen)
 
 
+def everything(campaign: Campaign, settings: Settings) -> Split:
+    """All runs to train on, for models that choose by folds; runs named for validation are left out while they choose."""
+    runs = np.arange(len(campaign.parameters))
+    named = split(campaign, settings, Notes()).validation if settings.validation.runs else runs[:0]
+    return Split(runs, named)
+
+
 class Runs:
     """The displacements of one level, or of some of its `nodes`, run by run: checked, and never all at once unless asked."""
 

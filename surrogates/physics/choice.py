@@ -1,0 +1,257 @@
+"""The registration of a campaign, chosen by cross-validation over training runs; what does not pay is left out.
+
+The three ideas do little alone and a tenth or more each once the others are in, so the search starts from all of them
+and then changes one thing at a time: the parity of parameters, the inputs, the exponents of the clock, the side flag.
+Inputs of one clock are first compared by likelihood, and only the best of them by folds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogates.data.campaign import Campaign
+from surrogates.errors import SurrogateError
+from surrogates.physics.clock import Clock, neighbours
+from surrogates.physics.derived import (
+    MASS,
+    SPEED,
+    STRESS,
+    DerivedInputs,
+    candidates,
+    is_positive,
+    logarithms,
+    parse_monomial,
+    places_for,
+    with_matrix,
+    with_monomial,
+)
+from surrogates.physics.registration import Registration
+from surrogates.physics.symmetry import Symmetry, may_be_odd
+from surrogates.physics.trials import Trials
+from surrogates.settings import Settings
+
+# A change is kept if it lowers the error by this share; the whole is if it does by the larger one.
+_WORTH_A_CHANGE = 0.003
+_WORTH_IT_ALL = 0.01
+_ROUNDS = 2
+# Sets of inputs that get to the folds in each round.
+_FINALISTS = 3
+# Fewer runs than this choose nothing.
+FEWEST = 6
+
+
+@dataclass
+class Worth:
+    """What was chosen, and what each idea was worth in cross-validation.
+
+    errors   e2, m, by what was tried: "as they are", "all", and each idea alone and left out
+    tried    registrations that were judged
+    """
+
+    errors: dict[str, float] = field(default_factory=dict)
+    tried: int = 0
+
+
+@dataclass(frozen=True)
+class _Way:
+    """One registration to be tried; `plane` is a place in the campaign's mirrors, None for no images."""
+
+    inputs: DerivedInputs
+    exponents: tuple[tuple[int, float], ...] = ()
+    plane: int | None = None
+    odd: tuple[str, ...] = ()
+    flagged: bool = False
+
+
+class _Search:
+    def __init__(self, campaign: Campaign, chosen: NDArray[np.int64], settings: Settings, trials: Trials) -> None:
+        self.campaign, self.settings, self.trials = campaign, settings, trials
+        self.parameters = campaign.parameters[chosen]
+        self.names = campaign.parameter_names
+        self.dimensions = campaign.dimensions or (None,) * len(self.names)
+        positive = [k for k in range(len(self.names)) if is_positive(self.parameters[:, k])]
+        clock = settings.physics.clock == "auto"
+        self.speeds = [k for k in positive if clock and self.dimensions[k] == SPEED]
+        self.others = tuple(k for k in positive if self.dimensions[k] in (STRESS, MASS))
+        self.plain = DerivedInputs.identity(self.names)
+        self.tried: set[_Way] = set()
+
+    def registration(self, way: _Way) -> Registration:
+        clock = Clock.identity(len(self.names))
+        if way.exponents:
+            clock = Clock.of(self.parameters, way.exponents[0][0], dict(way.exponents), float(self.campaign.time[0]))
+        mirror = None if way.plane is None else self.campaign.mirrors[way.plane]
+        symmetry = Symmetry() if mirror is None else Symmetry(mirror, way.odd, way.flagged)
+        return Registration(way.inputs, clock, symmetry, clock.grid(self.parameters, self.campaign.time))
+
+    def error(self, way: _Way) -> float:
+        self.tried.add(way)
+        return float(np.nanmean(self.trials.errors(self.registration(way), way.plane or 0)))
+
+    def best(self, ways: Sequence[_Way], margin: float = _WORTH_A_CHANGE) -> _Way:
+        """The first one unless another is better by `margin`."""
+        chosen = ways[0]
+        limit = self.error(chosen) * (1 - margin)
+        for way in ways[1:]:
+            error = self.error(way)
+            if error < limit:
+                chosen, limit = way, error
+        return chosen
+
+    def starts(self) -> list[_Way]:
+        """Everything at once, for each parity that parameters may have, and without images."""
+        inputs = self.sets(())[0] if self.settings.inputs.derived != "off" else self.plain
+        out = []
+        clocks = [_sorted(k, {k: 0.25, **dict.fromkeys(self._strengths, 0.25)}) for k in self.speeds]
+        for exponents in clocks or [()]:
+            out.append(_Way(inputs, exponents))
+            for plane, odd in self.parities():
+                out.append(_Way(inputs, exponents, plane, odd, flagged=True))
+        return out
+
+    @property
+    def _strengths(self) -> tuple[int, ...]:
+        return tuple(k for k in self.others if self.dimensions[k] == STRESS)
+
+    def parities(self) -> list[tuple[int, tuple[str, ...]]]:
+        """Planes and the parameters that change their sign there, as declared or to be tried."""
+        wish = self.settings.physics
+        if wish.symmetry == "off" or not self.campaign.mirrors:
+            return []
+        sets = may_be_odd(self.names, self.parameters) if wish.odd is None else [tuple(wish.odd)]
+        return [(plane, odd) for plane in range(len(self.campaign.mirrors)) for odd in sets if odd]
+
+    def sets(self, odd: tuple[str, ...]) -> list[DerivedInputs]:
+        """Inputs to choose from, without monomials."""
+        wish = self.settings.inputs.derived
+        if wish == "off":
+            return [self.plain]
+        logs = [logarithms(self.names, self.parameters, warp=warp) for warp in (True, False)]
+        if not isinstance(wish, str):
+            logs = [self._with_named(inputs, wish) for inputs in logs]
+        out = [*logs, *(with_matrix(inputs, odd) for inputs in logs), self.plain]
+        return list(dict.fromkeys(out))
+
+    def _with_named(self, inputs: DerivedInputs, wanted: Sequence[str]) -> DerivedInputs:
+        """Each named monomial in the place of its last parameter for which that is possible."""
+        for text in wanted:
+            powers = parse_monomial(text, self.names)
+            used = [k for k, power in enumerate(powers) if power]
+            bad = [self.names[k] for k in used if not is_positive(self.parameters[:, k])]
+            if bad:
+                raise SurrogateError(
+                    f"inputs.derived: {text!r} takes the logarithm of {bad[0]}, which is not positive or hardly changes"
+                )
+            places = places_for(inputs, powers)
+            if places:
+                inputs = with_monomial(inputs, powers, places[-1])
+        return inputs
+
+    def monomials(self, way: _Way) -> Iterator[DerivedInputs]:
+        """The inputs of `way` with one more monomial, each possible place, without those of odd parameters."""
+        if self.settings.inputs.derived != "auto":
+            return
+        for powers in candidates(self.names, self.dimensions, self.parameters):
+            if any(power and name in way.odd for power, name in zip(powers, self.names, strict=True)):
+                continue
+            if any(column.powers == powers for column in way.inputs.columns):
+                continue
+            for place in places_for(way.inputs, powers):
+                yield with_monomial(way.inputs, powers, place)
+
+    def improved_inputs(self, way: _Way) -> _Way:
+        """First logarithms, warps and the matrix, then one more monomial on top of what was best."""
+        way = self.best([way, *(replace(way, inputs=i) for i in self.sets(way.odd) if i != way.inputs)])
+        logs = replace(way.inputs, mixed=())
+        options = dict.fromkeys([logs, with_matrix(logs, way.odd)])
+        named = list(self.monomials(replace(way, inputs=logs)))
+        if len(named) > _FINALISTS:
+            likely = [-self.trials.likelihood(self.registration(replace(way, inputs=i)), way.plane or 0) for i in named]
+            named = [named[k] for k in np.argsort(likely)[:_FINALISTS]]
+        options |= dict.fromkeys(named)
+        return self.best([way, *(replace(way, inputs=i) for i in options if i != way.inputs)])
+
+    def improved_clock(self, way: _Way) -> _Way:
+        if not way.exponents:
+            return way
+        speed, exponents = way.exponents[0][0], dict(way.exponents)
+        options = [replace(way, exponents=_sorted(speed, e)) for e in neighbours(exponents, speed, self.others)]
+        return self.best([way, replace(way, exponents=()), *options])
+
+    def improved_symmetry(self, way: _Way) -> _Way:
+        if way.plane is None:
+            return way
+        return self.best([way, replace(way, flagged=not way.flagged), replace(way, plane=None, odd=(), flagged=False)])
+
+
+def choose(
+    campaign: Campaign,
+    chosen: NDArray[np.int64],
+    settings: Settings,
+    trials: Trials,
+    tell: Callable[[str], None] = lambda line: None,
+) -> tuple[Registration, int, Worth]:
+    """The registration of the training runs `chosen`, the place of its plane, and what it is worth.
+
+    The identity where runs are few, nothing is known of the parameters, or nothing was gained.
+    """
+    search = _Search(campaign, chosen, settings, trials)
+    _check_odd(settings, search.names)
+    identity = _Way(search.plain)
+    worth = Worth()
+    if len(chosen) < FEWEST:
+        return search.registration(identity), 0, worth
+    way = search.best([identity, *search.starts()], margin=0.0)
+    if way == identity:
+        way = search.best(search.starts(), margin=0.0)
+    tell("inputs, clock and symmetry: all at once")
+    for _ in range(_ROUNDS):
+        before = way
+        way = search.improved_inputs(way)
+        way = search.improved_clock(way)
+        way = search.improved_symmetry(way)
+        if way == before:
+            break
+    way = search.best([identity, way], margin=_WORTH_IT_ALL)
+    worth.errors = _worth(search, identity, way)
+    worth.tried = len(search.tried)
+    return search.registration(way), way.plane or 0, worth
+
+
+def _worth(search: _Search, identity: _Way, way: _Way) -> dict[str, float]:
+    """e2, m: as they are, all, and each idea alone and left out."""
+    out = {"parameters as they are": search.error(identity)}
+    if way == identity:
+        return out
+    ideas: dict[str, dict[str, Any]] = {
+        "derived inputs": {"inputs": identity.inputs},
+        "clock and size": {"exponents": ()},
+        "mirrored runs": {"plane": None, "odd": (), "flagged": False},
+    }
+    used = {name: none for name, none in ideas.items() if any(getattr(way, k) != v for k, v in none.items())}
+    for name, none in used.items():
+        alone = replace(identity, **{k: getattr(way, k) for k in none})
+        out[f"{name} alone"] = search.error(alone)
+    for name, none in used.items():
+        out[f"all but {name}"] = search.error(replace(way, **none))
+    if way.flagged:
+        out["all but the side as an input"] = search.error(replace(way, flagged=False))
+    out["all of it"] = search.error(way)
+    return out
+
+
+def _check_odd(settings: Settings, names: Sequence[str]) -> None:
+    for name in settings.physics.odd or ():
+        if name not in names:
+            raise SurrogateError(f"physics.odd names {name!r}, which is no parameter; there are {', '.join(names)}")
+
+
+def _sorted(speed: int, exponents: dict[int, float]) -> tuple[tuple[int, float], ...]:
+    """The speed first, then the others that count, in order."""
+    rest = sorted((k, v) for k, v in exponents.items() if k != speed and v)
+    return ((speed, exponents.get(speed, 0.0)), *rest)

@@ -1,0 +1,169 @@
+"""Registration of a whole campaign: put on a reference's clock and size, doubled by images, with derived inputs.
+
+It is a change of variables that any model can be trained behind, like taking rigid motion out: learn on the registered
+campaign, and bring predictions back to the query's own clock and size. Clock, symmetry and inputs each have an identity,
+where they do not pay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogates.data.campaign import Campaign
+from surrogates.data.samples import Notes, Runs, Split
+from surrogates.physics.clock import Clock
+from surrogates.physics.derived import DerivedInputs
+from surrogates.physics.symmetry import Symmetry
+from surrogates.settings import Settings
+
+# Registered name of the input that says whether a run is mirrored.
+SIDE = "mirrored"
+
+
+@dataclass(frozen=True)
+class Registration:
+    """How a campaign is registered.
+
+    inputs, clock, symmetry  see `surrogates.physics`
+    grid                     (state,) s, the reference's times on which registered runs are given
+    """
+
+    inputs: DerivedInputs
+    clock: Clock
+    symmetry: Symmetry
+    grid: NDArray[np.float64]
+
+    @classmethod
+    def identity(cls, names: tuple[str, ...], time: NDArray[np.float64]) -> Registration:
+        """The campaign as it is."""
+        return cls(DerivedInputs.identity(names), Clock.identity(len(names)), Symmetry(), np.asarray(time, np.float64))
+
+    @property
+    def is_identity(self) -> bool:
+        return self.inputs.is_identity and self.clock.is_identity and self.symmetry.is_identity
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Names of the inputs of a model behind it."""
+        return (*self.inputs.told(), *((SIDE,) if self.symmetry.flagged else ()))
+
+    def apply(self, campaign: Campaign, settings: Settings, notes: Notes) -> Campaign:
+        """The registered campaign: its runs, then their images in the same order.
+
+        Fields are read run by run as before. `known` says how far each run was computed: states beyond are its last
+        slope going on, and belong in no loss and no error.
+        """
+        if self.is_identity:
+            return campaign
+        runs = campaign.parameters
+        images = self.symmetry.images(runs, campaign.parameter_names)
+        doubled = runs if self.symmetry.is_identity else np.concatenate([runs, images])
+        names = campaign.runs or tuple(str(k) for k in range(len(runs)))
+        told = self.input_names
+        return replace(
+            campaign,
+            parameters=self._inputs(doubled, len(runs)),
+            parameter_names=told,
+            parameter_units=("1",) * len(told),
+            time=self.grid,
+            displacement=lambda level: _RegisteredField(self, campaign, settings, notes, level),
+            runs=names if self.symmetry.is_identity else (*names, *(f"{name} {SIDE}" for name in names)),
+            dimensions=(),
+            mirrors=(),
+            known=self.clock.known(doubled, campaign.time, self.grid),
+        )
+
+    def split(self, split: Split, runs: int) -> Split:
+        """Places in the registered campaign: images train with their runs, and never choose."""
+        if self.symmetry.is_identity:
+            return split
+        return replace(split, training=np.concatenate([split.training, split.training + runs]))
+
+    def read(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Inputs (run, input) of a model for parameters (run, parameter) of runs as computed."""
+        return self._inputs(np.atleast_2d(parameters), len(np.atleast_2d(parameters)))
+
+    def undo(
+        self,
+        model: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray],
+        parameters: NDArray[np.float64],
+        time: NDArray[np.float64],
+    ) -> NDArray:
+        """What the `model` behind it, (run, input) and (state,) -> (run, state, ..), says of runs at their own times.
+
+        parameters  (run, parameter); time (state,), s
+        """
+        inputs = self.read(parameters)
+        if self.clock.is_identity:
+            return model(inputs, time)
+        sizes = self.clock.size(parameters)
+        out = []
+        for k in range(len(parameters)):
+            states = model(inputs[k : k + 1], self.clock.times(parameters[k], time))
+            out.append(states * np.asarray(sizes[k], states.dtype))
+        return np.concatenate(out)
+
+    def _inputs(self, parameters: NDArray[np.float64], computed: int) -> NDArray[np.float64]:
+        out = self.inputs.apply(parameters)
+        if not self.symmetry.flagged:
+            return out
+        side = (np.arange(len(parameters)) >= computed).astype(np.float64)
+        return np.concatenate([out, side[:, None]], axis=1)
+
+    def told(self) -> dict[str, str]:
+        """What was chosen, for people."""
+        return {
+            "inputs": ", ".join(self.input_names) + (" (full matrix of lengths)" if self.inputs.mixed else ""),
+            "clock": self.clock.told(self.inputs.names),
+            "symmetry": self.symmetry.told(),
+        }
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "inputs": self.inputs.as_dict(),
+            "clock": self.clock.as_dict(),
+            "symmetry": self.symmetry.as_dict(),
+            "grid": self.grid.tolist(),
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Registration:
+        """The way back; enough to predict, not to register a campaign anew."""
+        return cls(
+            DerivedInputs.from_dict(values["inputs"]),
+            Clock.from_dict(values["clock"]),
+            Symmetry.from_dict(values["symmetry"]),
+            np.array(values["grid"], np.float64),
+        )
+
+
+class _RegisteredField:
+    """Displacements (run and image, state of the grid, node of a level, 3), m, run by run."""
+
+    def __init__(
+        self, registration: Registration, campaign: Campaign, settings: Settings, notes: Notes, level: int
+    ) -> None:
+        self._of, self._campaign = registration, campaign
+        mirrors = not registration.symmetry.is_identity
+        self._own = Runs(campaign, level, settings, notes)
+        # An image is put together from the full mesh: mirrored nodes of a level lie between nodes the level lacks.
+        self._full = Runs(campaign, 0, settings, notes) if mirrors and level else self._own
+        self._nodes = campaign.levels[level - 1].kept if level else None
+        count = len(campaign.parameters)
+        self.shape = (count * (1 + mirrors), len(registration.grid), self._own.nodes, 3)
+        self._count = count
+
+    def __getitem__(self, run: int, /) -> NDArray[np.float32]:
+        of, parameters = self._of, self._campaign.parameters
+        if run < self._count:
+            states = self._own.read(run)
+        else:
+            run -= self._count
+            states = of.symmetry.apply(self._full.read(run), self._nodes)
+        return np.asarray(of.clock.apply(states, parameters[run], self._campaign.time, of.grid), np.float32)

@@ -1,0 +1,105 @@
+"""Symmetry: a structure that is its own mirror image gives every run a second one, for nothing.
+
+With the reflection R = I - 2 n n^T and the field at mirrored places, the image of a run is u'(x) = R u(R x). Parameters
+that say on which side something happens (an angle, an offset) change their sign: they are odd; the others stay as they
+are. A mesh is rarely as symmetric as its shape, so an image is a little less true than a run. One more input, the side
+(0 as computed, 1 mirrored), lets a model trust it less.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from surrogates.data.campaign import Mirror
+
+# Parameters that may be odd and are tried in all combinations.
+_TRIED = 3
+
+
+@dataclass(frozen=True)
+class Symmetry:
+    """The images that a campaign is doubled by.
+
+    mirror   the plane, with the map of fields; None: no images
+    odd      parameters that change their sign in the mirror
+    flagged  whether the side is one more input
+    """
+
+    mirror: Mirror | None = None
+    odd: tuple[str, ...] = ()
+    flagged: bool = False
+
+    @property
+    def is_identity(self) -> bool:
+        return self.mirror is None
+
+    def images(self, parameters: NDArray[np.float64], names: Sequence[str]) -> NDArray[np.float64]:
+        """Parameters (run, parameter) of the mirrored runs."""
+        return parameters * np.where([name in self.odd for name in names], -1.0, 1.0)
+
+    def apply(self, states: NDArray[np.float32], nodes: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
+        """The mirror image of states (state, node of the full mesh, 3), m, on `nodes` of the full mesh (default: all).
+
+        Applied twice it gives the states back as far as the mesh is symmetric.
+        """
+        return mirrored(self.mirror, states, nodes) if self.mirror is not None else states
+
+    def told(self) -> str:
+        """The symmetry in a line."""
+        if self.mirror is None:
+            return "no mirrored runs"
+        odd = f"{', '.join(self.odd)} with the opposite sign" if self.odd else "all parameters as they are"
+        side = ", the side is an input" if self.flagged else ""
+        return f"every run also mirrored at {self.mirror.name}, {odd}{side}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values; the map of fields is left out, since only training needs it."""
+        plane = None
+        if self.mirror is not None:
+            plane = {
+                "reflection": self.mirror.reflection.tolist(), "name": self.mirror.name, "told": self.mirror.told,
+            }  # fmt: skip
+        return {"mirror": plane, "odd": list(self.odd), "flagged": self.flagged}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Symmetry:
+        """The way back, with an empty map."""
+        plane = values["mirror"]
+        mirror = None
+        if plane is not None:
+            none = sparse.csr_matrix((0, 0))
+            mirror = Mirror(np.array(plane["reflection"], np.float64), none, str(plane["name"]), str(plane["told"]))
+        return cls(mirror, tuple(values["odd"]), bool(values["flagged"]))
+
+
+def mirrored(
+    mirror: Mirror, states: NDArray[np.float32], nodes: NDArray[np.int64] | None = None
+) -> NDArray[np.float32]:
+    """(state, node, 3): the image of states (state, node of the full mesh, 3) in `mirror`, on `nodes` (default: all)."""
+    rows = mirror.to_image if nodes is None else mirror.to_image[nodes]
+    rows = rows.astype(states.dtype)
+    count = len(states)
+    flat = rows @ states.transpose(1, 0, 2).reshape(states.shape[1], -1)
+    turned = flat.reshape(-1, count, 3) @ mirror.reflection.T.astype(states.dtype)
+    return np.ascontiguousarray(turned.transpose(1, 0, 2))
+
+
+def may_be_odd(names: Sequence[str], parameters: NDArray[np.float64]) -> list[tuple[str, ...]]:
+    """Sets of parameters that could change their sign in a mirror: those with values on both sides of zero.
+
+    parameters  (run, parameter). All combinations of the first few, the fewest first; empty where none qualifies.
+    """
+    both = [
+        n for k, n in enumerate(names)
+        if parameters[:, k].min() < 0 < parameters[:, k].max()
+        and min(-parameters[:, k].min(), parameters[:, k].max()) > 0.2 * np.abs(parameters[:, k]).max()
+    ]  # fmt: skip
+    some = both[:_TRIED]
+    out = [tuple(n for i, n in enumerate(some) if bits >> i & 1) for bits in range(1, 1 << len(some))]
+    return sorted(out, key=len)

@@ -1,0 +1,295 @@
+"""What a registration is worth: a process over whole runs, judged by folds over the training runs, on POD coefficients.
+
+Runs and images are projected once on a common basis, large enough to lose nothing that matters. There a registration
+is a matter of small arrays, and one trial of all folds takes about a second. Errors are distances of nodes, measured on
+some nodes and states of the left-out runs as computed; a run and its image always lie in the same fold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogates.data.campaign import Campaign, Mirror
+from surrogates.data.inputs import over_range
+from surrogates.data.samples import Notes, Runs
+from surrogates.errors import SurrogateError
+from surrogates.physics.registration import Registration
+from surrogates.physics.symmetry import mirrored
+from surrogates.reductions.pod import pod
+from surrogates.regression.gaussian import Gaussian, Kernel, RadialBasis
+from surrogates.settings import Settings
+
+# Modes of the common basis, and numbers a field of that many modes may hold at most.
+MODES = 128
+_NUMBERS = 3e8
+# Singular values below this share of the largest are rounding.
+_SMALLEST = 1e-5
+# States of a run that the basis is made of, nodes and states on which errors are measured, states of the likelihood.
+_BASIS_STATES = 32
+_JUDGED_NODES, _JUDGED_STATES = 400, 21
+_LIKELIHOOD_STATES = 21
+# Up to so many runs each is left out in turn.
+_LEAVE_ONE = 12
+
+
+@dataclass(frozen=True)
+class Folds:
+    """Training runs in parts that are left out in turn: part (run,) of each."""
+
+    part: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, runs: int, count: int, seed: int) -> Folds:
+        """`count` parts of about the same size, drawn by the seed; each run its own part where there are few, none for one or two."""
+        if runs < 3:
+            return cls(np.full(runs, -1))
+        count = runs if runs <= max(_LEAVE_ONE, count) else count
+        part = np.empty(runs, np.int64)
+        part[np.random.default_rng(seed).permutation(runs)] = np.arange(runs) % count
+        return cls(part)
+
+    @property
+    def count(self) -> int:
+        """How many times some runs are left out."""
+        return int(self.part.max(initial=-1)) + 1
+
+    def __iter__(self) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+        """Places of the runs that train, and of those left out; runs of part -1 are never left out."""
+        for k in range(self.count):
+            yield np.flatnonzero(self.part != k), np.flatnonzero(self.part == k)
+
+
+@dataclass
+class Courses:
+    """Runs and images as coefficients of one basis.
+
+    modes       (3 * node, mode) float32, orthonormal; the first three are translations
+    own         (run, state, mode); images (run, state, mode) of each plane
+    nodes       judged nodes, states judged states, truth (run, judged state, judged node, 3), m
+    """
+
+    modes: NDArray[np.float32]
+    time: NDArray[np.float64]
+    own: NDArray[np.float32]
+    images: dict[int, NDArray[np.float32]]
+    nodes: NDArray[np.int64]
+    states: NDArray[np.int64]
+    truth: NDArray[np.float32]
+
+    @classmethod
+    def of(
+        cls, campaign: Campaign, runs: Runs, chosen: NDArray[np.int64], mirrors: Sequence[Mirror], modes: int, seed: int
+    ) -> Courses:
+        """The runs `chosen`, read twice: once for the basis, once for the coefficients."""
+        length = 3 * runs.nodes
+        count = int(max(8, min(modes, _NUMBERS / length / 3)))
+        basis = np.concatenate([_translations(runs.nodes), _without_translations(runs, chosen, mirrors, count)], axis=1)
+        own = np.empty((len(chosen), runs.states, basis.shape[1]), np.float32)
+        images = {k: np.empty_like(own) for k in range(len(mirrors))}
+        draw = np.random.default_rng(seed)
+        nodes = np.sort(draw.permutation(runs.nodes)[:_JUDGED_NODES])
+        states = np.unique(np.linspace(0, runs.states - 1, _JUDGED_STATES).astype(int))
+        truth = np.empty((len(chosen), len(states), len(nodes), 3), np.float32)
+        for k, run in enumerate(chosen):
+            values = runs.read(run)
+            own[k] = values.reshape(len(values), -1) @ basis
+            truth[k] = values[states][:, nodes]
+            for plane, mirror in enumerate(mirrors):
+                images[plane][k] = mirrored(mirror, values).reshape(len(values), -1) @ basis
+        return cls(basis, campaign.time.astype(np.float64), own, images, nodes, states, truth)
+
+    def registered(
+        self, registration: Registration, parameters: NDArray[np.float64], plane: int
+    ) -> NDArray[np.float32]:
+        """(run and image, state of the grid, mode): coefficients on the reference's clock."""
+        own = [registration.clock.apply(c, p, self.time, registration.grid) for c, p in zip(self.own, parameters)]
+        if registration.symmetry.is_identity:
+            return np.stack(own)
+        images = (
+            registration.clock.apply(c, p, self.time, registration.grid)
+            for c, p in zip(self.images[plane], parameters, strict=True)
+        )
+        return np.stack([*own, *images])
+
+
+@dataclass
+class Trials:
+    """Judges registrations by folds; what was measured is kept.
+
+    parameters  (run, parameter) of the training runs
+    machine     "pod-gpr" or "pod-rbf": the regression
+    """
+
+    courses: Courses
+    parameters: NDArray[np.float64]
+    folds: Folds
+    machine: str
+    seed: int
+    _known: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    _registered: tuple[str, NDArray[np.float32]] | None = None
+
+    def errors(self, registration: Registration, plane: int = 0) -> NDArray[np.float64]:
+        """(run,) e2, m, of each run, predicted without it; NaN for those that are never left out."""
+        key = f"{plane} {registration.inputs} {registration.clock} {registration.symmetry.odd} " + str(
+            (registration.symmetry.is_identity, registration.symmetry.flagged)
+        )
+        if key not in self._known:
+            out = np.full(len(self.parameters), np.nan)
+            try:
+                for held, coefficients in self.predicted(registration, plane):
+                    out[held] = self.distances(held, coefficients)
+            except SurrogateError:  # inputs that radial basis functions cannot tell apart
+                out[self.folds.part >= 0] = np.inf
+            self._known[key] = out
+        return self._known[key]
+
+    def predicted(
+        self, registration: Registration, plane: int = 0
+    ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32]]]:
+        """Places of the left-out runs of each fold, and what the others say of them, (run, state, mode)."""
+        inputs, values = self.inputs(registration), self.values(registration, plane)
+        start = None
+        for train, held in self.folds:
+            part = self.with_images(registration, train)
+            machine = self.fitted(registration, inputs[part], values[part], start)
+            start = getattr(machine, "kernel", None)
+            flat = values[part].reshape(len(part), -1)
+
+            def course(
+                x: NDArray[np.float64], time: NDArray[np.float64], machine: Machine = machine,
+                part: NDArray[np.int64] = part, flat: NDArray[np.float32] = flat,
+            ) -> NDArray[np.float32]:  # fmt: skip
+                scaled = over_range(x, inputs[part])
+                out = (machine.weights(scaled).astype(np.float32) @ flat).reshape(len(x), *values.shape[1:])
+                return _at(out, registration.grid, time)
+
+            yield held, registration.undo(course, self.parameters[held], self.courses.time).astype(np.float32)
+
+    def deviations(self, registration: Registration, plane: int = 0) -> NDArray[np.float64]:
+        """(run,): what the process of the other folds believes its error to be, up to a factor."""
+        inputs, values = self.inputs(registration), self.values(registration, plane)
+        out = np.ones(len(self.parameters))
+        for train, held in self.folds:
+            part = self.with_images(registration, train)
+            machine = self.fitted(registration, inputs[part], values[part])
+            if isinstance(machine, Gaussian):
+                out[held] = machine.deviation(over_range(inputs[held], inputs[part]))
+        return out
+
+    def likelihood(self, registration: Registration, plane: int = 0) -> float:
+        """Of all training runs, for each sample and output: compares inputs of one clock."""
+        inputs, values = self.inputs(registration), self.values(registration, plane)
+        machine = self.fitted(registration, inputs, values)
+        return machine.likelihood if isinstance(machine, Gaussian) else 0.0
+
+    def fitted(
+        self,
+        registration: Registration,
+        inputs: NDArray[np.float64],
+        values: NDArray[np.float32],
+        start: Kernel | None = None,
+    ) -> Machine:
+        """The regression of courses (run, state, mode) by inputs (run, input)."""
+        return course_machine(self.machine, inputs, values, registration.inputs.mixed, self.seed, start)
+
+    def inputs(self, registration: Registration) -> NDArray[np.float64]:
+        """(run and image, input)"""
+        names = registration.inputs.names
+        own = registration.read(self.parameters)
+        if registration.symmetry.is_identity:
+            return own
+        images = registration.read(registration.symmetry.images(self.parameters, names))
+        if registration.symmetry.flagged:
+            images[:, -1] = 1.0
+        return np.concatenate([own, images])
+
+    def values(self, registration: Registration, plane: int) -> NDArray[np.float32]:
+        """(run and image, state of the grid, mode); the last clock's are kept."""
+        key = f"{plane} {registration.clock} {registration.symmetry.is_identity}"
+        if self._registered is None or self._registered[0] != key:
+            self._registered = (key, self.courses.registered(registration, self.parameters, plane))
+        return self._registered[1]
+
+    def with_images(self, registration: Registration, runs: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Places of the runs and their images."""
+        return runs if registration.symmetry.is_identity else np.concatenate([runs, runs + len(self.parameters)])
+
+    def distances(self, held: NDArray[np.int64], coefficients: NDArray[np.float32]) -> NDArray[np.float64]:
+        c = self.courses
+        rows = c.modes.reshape(-1, 3, c.modes.shape[1])[c.nodes].reshape(-1, c.modes.shape[1])
+        said = (coefficients[:, c.states] @ rows.T).reshape(c.truth[held].shape)
+        return np.linalg.norm(said - c.truth[held], axis=-1).mean(axis=(1, 2))
+
+
+Machine = Gaussian | RadialBasis
+
+
+def course_machine(
+    name: str,
+    inputs: NDArray[np.float64],
+    values: NDArray[np.floating],
+    mixed: Sequence[int],
+    seed: int,
+    start: Kernel | None = None,
+) -> Machine:
+    """The regression `name` ("pod-gpr" or "pod-rbf") of whole courses (run, state, mode) by inputs (run, input).
+
+    mixed  inputs with a full matrix of lengths; none of them is constant
+    """
+    x = over_range(inputs, inputs)
+    if name == "pod-rbf":
+        return RadialBasis(x)
+    every = max(1, values.shape[1] // _LIKELIHOOD_STATES)
+    some = values[:, ::-every].reshape(len(values), -1).astype(np.float64)
+    moves = np.flatnonzero(np.ptp(inputs, axis=0) > 0).tolist()
+    return Gaussian(x, mixed=[moves.index(k) for k in mixed if k in moves]).fit(some, seed, start)
+
+
+def courses_of(campaign: Campaign, settings: Settings, chosen: NDArray[np.int64], notes: Notes) -> Courses:
+    """The runs `chosen` of the full mesh with the images of all planes."""
+    runs = Runs(campaign, 0, settings, notes)
+    modes = max(MODES, max(settings.pod.modes, default=0))
+    return Courses.of(campaign, runs, chosen, campaign.mirrors, modes, settings.seed)
+
+
+def _translations(nodes: int) -> NDArray[np.float32]:
+    """(3 * node, 3): the structure as a whole moved along each axis, of length 1."""
+    return np.tile(np.eye(3, dtype=np.float32), (nodes, 1)) / np.float32(np.sqrt(nodes))
+
+
+def _without_translations(
+    runs: Runs, chosen: NDArray[np.int64], mirrors: Sequence[Mirror], count: int
+) -> NDArray[np.float32]:
+    """(3 * node, mode): POD of runs and images, of what is left without their translation."""
+
+    def states() -> Iterator[NDArray[np.float32]]:
+        held: list[NDArray[np.float32]] = []
+        for run in chosen:
+            values = runs.read(run)
+            values = values[np.unique(np.linspace(0, len(values) - 1, _BASIS_STATES).astype(int))]
+            for part in (values, *(mirrored(mirror, values) for mirror in mirrors)):
+                held.append(part - part.mean(axis=1, keepdims=True))
+            if sum(map(len, held)) >= 2 * count:  # a few runs at once cost less than one by one
+                yield np.concatenate(held)
+                held = []
+        if held:
+            yield np.concatenate(held)
+
+    basis = pod(states(), count)
+    good = basis.singular_values > _SMALLEST * basis.singular_values[0]
+    if not good.any():
+        return basis.modes[:, :0]
+    modes = basis.modes[:, good].reshape(-1, 3, int(good.sum()))
+    modes -= modes.mean(axis=0, dtype=np.float64)  # what rounding left of translations in faint modes
+    return np.asarray(np.linalg.qr(modes.reshape(len(modes) * 3, -1))[0], np.float32)
+
+
+def _at(course: NDArray[np.float32], trained: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float32]:
+    """(run, state, mode) at other times, linear."""
+    from surrogates.physics.clock import between
+
+    return np.asarray(between(course.transpose(1, 0, 2), trained, time).transpose(1, 0, 2))
