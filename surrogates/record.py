@@ -50,7 +50,8 @@ class Record:
     time        (state,) s, the states it was trained on
     fits        how each level's training went
     errors      e2 (m) by what was measured, on validation runs, on the level's own nodes
-    choice      what a POD regression chose on the validation runs: inputs and modes
+    choice      what a POD regression chose by cross-validation: inputs and modes
+    physics     inputs, clock and symmetry in words, and "errors": e2 (m) by what each was worth in cross-validation
     notes       what was unusual about the data
     """
 
@@ -67,6 +68,7 @@ class Record:
     fits: dict[int, Fit] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
     choice: dict[str, Any] = field(default_factory=dict)
+    physics: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     @classmethod
@@ -126,6 +128,7 @@ def record_from_dict(values: Mapping[str, Any], histories: Mapping[int, dict[str
         },
         errors=dict(values["errors"]),
         choice=dict(values["choice"]),
+        physics=dict(values["physics"]),
         notes=list(values["notes"]),
     )  # fmt: skip
 

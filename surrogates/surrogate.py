@@ -16,6 +16,7 @@ from surrogates.errors import SurrogateError
 from surrogates.models.base import Network
 from surrogates.models.pod_regression import PodRegression
 from surrogates.operators.convolutions import exportable
+from surrogates.physics.registration import Registration
 from surrogates.record import Fit, Record
 from surrogates.settings import Settings
 from surrogates.uncertainty import Band
@@ -47,10 +48,12 @@ class Surrogate:
         core: Network | PodRegression,
         points: NDArray[np.float64] | None = None,
         faces: NDArray[np.int32] | None = None,
+        registration: Registration | None = None,
     ) -> None:
         self.settings, self.record, self.graphs, self.core = settings, record, graphs, core
         self.points, self.faces = points, faces
         self.labels: Labels | None = None
+        self.registration = registration or Registration.identity(record.ranges.names, record.time)
         self.bands: dict[tuple[int, bool], Band] = {}
         self._upward: dict[int, sparse.csr_matrix] = {}
 
@@ -71,10 +74,7 @@ class Surrogate:
         """
         number = self.number(level)
         values, times = self.checked(parameters, time)
-        if isinstance(self.core, PodRegression):
-            out = self.core.displacement(values, times, number)
-        else:
-            out = self._by_network(values, times, number)
+        out = self.registration.undo(lambda x, t: self._registered(x, t, number), values, times)
         return out[0] if np.ndim(parameters) == 1 else out
 
     def predict_full(
@@ -85,7 +85,9 @@ class Surrogate:
         values, times = self.checked(parameters, time)
         if number == 0 or isinstance(self.core, PodRegression):
             return self.lift(self.predict(parameters, times, number), number)
-        out = self._by_network(values, times, number, lambda states: self._lifted(states, number))
+        out = self.registration.undo(
+            lambda x, t: self._by_network(x, t, number, lambda states: self._lifted(states, number)), values, times
+        )
         return out[0] if np.ndim(parameters) == 1 else out
 
     def lift(self, states: NDArray[np.float32], level: int) -> NDArray[np.float32]:
@@ -182,6 +184,12 @@ class Surrogate:
         number = self.number(level)
         return sum(kept.seconds for k, kept in self.record.fits.items() if k >= number or self.settings.unified)
 
+    def _registered(self, inputs: NDArray[np.float64], time: NDArray[np.float64], number: int) -> NDArray[np.float32]:
+        """What the core says of registered inputs (batch, input) at registered times: (batch, state, node, 3)."""
+        if isinstance(self.core, PodRegression):
+            return self.core.displacement(inputs, time, number)
+        return self._by_network(inputs, time, number)
+
     def _by_network(
         self,
         parameters: NDArray[np.float64],
@@ -242,8 +250,8 @@ def sensitivity(
     parameters  (parameter,), time (state,) s and level as in `Surrogate.predict`
     nodes       node numbers on the level; default: all
 
-    Networks are differentiated automatically, in forward mode; Gaussian processes and radial basis functions by central
-    differences over a thousandth of the trained range.
+    Networks are differentiated automatically, in forward mode; Gaussian processes, radial basis functions and whatever
+    stands behind a registration by central differences over a thousandth of the trained range.
     """
     number = surrogate.number(level)
     values, times = surrogate.checked(parameters, time)
@@ -255,7 +263,7 @@ def sensitivity(
         core = surrogate.core
         moved = (
             _forward_mode(core, values[0], times, number, k)
-            if isinstance(core, Network)
+            if isinstance(core, Network) and surrogate.registration.is_identity
             else _central(surrogate, values[0], times, number, k)
         )
         columns.append(moved[:, chosen])

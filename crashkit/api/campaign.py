@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
-    from surrogates.data.campaign import Campaign, GraphLevel, Labels
+    from surrogates.data.campaign import Campaign, GraphLevel, Labels, Mirror
 
 
 class RunField:
@@ -33,8 +33,10 @@ class RunField:
             return dataset["displacement"].isel(sim=self._runs[run]).values
 
 
-def open_campaign(path: str | Path, test: Any = None) -> Campaign:
+def open_campaign(path: str | Path, test: Any = None, *, symmetry: bool = False) -> Campaign:
     """The runs of the dataset at `path` without the test runs, as `crashkit.selection.runs_of` understands `test`.
+
+    symmetry  look for mirror planes of the mesh, where a parameter could say on which side something happens
 
     The full field is read run by run by those models that need it; the cascade reads its levels only.
 
@@ -47,6 +49,7 @@ def open_campaign(path: str | Path, test: Any = None) -> Campaign:
     from crashkit.mesh.store import level_displacement
     from crashkit.selection import runs_of
     from data_schema import fields, parameters, table_unit
+    from data_schema.dimensions import dimension
     from surrogates.data.campaign import Campaign
 
     path = Path(path)
@@ -67,8 +70,10 @@ def open_campaign(path: str | Path, test: Any = None) -> Campaign:
     def displacement(level: int) -> Any:
         return RunField(path, chosen, states, nodes) if level == 0 else level_displacement(path, level, chosen)
 
+    values = np.stack([dataset[n].values[chosen].astype(np.float64) for n in names], axis=1)
+    two_sided = bool(((values.min(axis=0) < 0) & (values.max(axis=0) > 0)).any())
     return Campaign(
-        parameters=np.stack([dataset[n].values[chosen].astype(np.float64) for n in names], axis=1),
+        parameters=values,
         parameter_names=tuple(names),
         parameter_units=tuple(str(dataset[n].attrs.get("units", "")) for n in names),
         time=dataset["time"].values.astype(np.float64),
@@ -84,6 +89,8 @@ def open_campaign(path: str | Path, test: Any = None) -> Campaign:
         faces=dataset["face_nodes"].values.astype(np.int32),
         labels=labels_of(dataset),
         table_units=tuple(table_unit(dataset, n) for n in names),
+        dimensions=tuple(dimension(str(dataset[n].attrs.get("units", ""))) for n in names),
+        mirrors=_mirrors(dataset) if symmetry and two_sided else (),
     )
 
 
@@ -96,10 +103,34 @@ def labels_of(dataset: xr.Dataset) -> Labels:
     return Labels(**ids, part_name=tuple(map(str, dataset["part_name"].values)), face_id=face_id)
 
 
+def _mirrors(dataset: Any) -> tuple[Mirror, ...]:
+    """The mirror planes of the dataset's mesh, without those of a mesh that differs from run to run."""
+    from crashkit.errors import MeshError
+    from crashkit.mesh.symmetry import mirror_planes
+    from surrogates.data.campaign import Mirror
+
+    at = dataset["reference_position"]
+    if "sim" in at.dims and float((at.max("sim") - at.min("sim")).max()) > 1e-9:
+        return ()
+    at = at.isel(sim=0) if "sim" in at.dims else at
+    part = dataset["face_part"].values if "face_part" in dataset else None
+    try:
+        planes = mirror_planes(at.values, dataset["face_nodes"].values, part)
+    except MeshError:
+        return ()
+    return tuple(Mirror(plane.reflection, plane.to_image, plane.name, plane.told()) for plane in planes)
+
+
 def _levels(path: Path) -> tuple[GraphLevel, ...]:
     """The hierarchy as the surrogates take it; empty where the dataset has none."""
-    from crashkit.mesh.store import has_hierarchy, read_hierarchy
+    from crashkit.errors import DataError
+    from crashkit.mesh.store import read_hierarchy
     from surrogates.data.campaign import GraphLevel
 
-    stored = read_hierarchy(path).levels if has_hierarchy(path) else ()
+    try:
+        stored = read_hierarchy(path).levels
+    except DataError as error:
+        if "has no mesh hierarchy" in str(error):
+            return ()
+        raise
     return tuple(GraphLevel(k.index, k.kept, k.faces, k.edges, k.in_finer, k.to_finer, k.to_full) for k in stored)

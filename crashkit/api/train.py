@@ -64,7 +64,8 @@ def train(
     output = Path(output)
     chosen = settings(model, preset, config, overrides)
     check_output(output, overwrite)
-    campaign = open_campaign(dataset, test)
+    by_folds = chosen.model in ("pod-gpr", "pod-rbf")
+    campaign = open_campaign(dataset, test, symmetry=by_folds and chosen.physics.symmetry == "auto")
     state = output.with_name(f".{output.name}.training")
     with (
         _processes(device) as first,

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -33,6 +33,12 @@ def command(
     test: Annotated[
         str, typer.Option(help="Runs held out for testing: 27:36, names, a count or a fraction.", show_default="none")
     ] = "",
+    odd: Annotated[
+        str,
+        typer.Option(
+            help="Parameters that change their sign in the mirror, such as impact_angle.", show_default="tried in turn"
+        ),
+    ] = "",
     epochs: Annotated[
         int | None, typer.Option(help="Epochs of every level.", min=1, show_default="from the settings")
     ] = None,
@@ -46,6 +52,8 @@ def command(
 ) -> None:
     """Train a surrogate and store it as a folder. Ctrl-C stops early and keeps the best weights so far."""
     given = list(settings or ())
+    if odd:
+        given.append(f"physics.odd=[{odd}]")
     if epochs is not None:
         given += [f"level.epochs={epochs}", "transfer.epochs=1"]
     if seed is not None:
@@ -115,7 +123,7 @@ def _as_json(surrogate: Surrogate, output: Path) -> dict[str, object]:
     return {
         "output": output, "levels": _levels(surrogate), "choice": record.choice, "validation_errors_m": record.errors,
         "training_runs": record.fitted_runs, "validation_runs": record.validation_runs,
-        "held_out_runs": record.held_out_runs, "notes": record.notes,
+        "held_out_runs": record.held_out_runs, "physics": record.physics, "notes": record.notes,
     }  # fmt: skip
 
 
@@ -137,5 +145,18 @@ def show(surrogate: Surrogate, output: Path) -> None:
             for r in _levels(surrogate)
         ),
     )  # fmt: skip
+    for line in _physics(record.physics):
+        say(line)
     if record.choice:
-        say("chosen on validation runs: " + ", ".join(f"{k} {v}" for k, v in record.choice.items()))
+        by = "on validation runs" if record.validation_runs and not record.physics else "by cross-validation"
+        say(f"chosen {by}: " + ", ".join(f"{k} {v}" for k, v in record.choice.items()))
+
+
+def _physics(physics: Mapping[str, Any]) -> list[str]:
+    """What was put in beforehand, and what it was worth."""
+    out = [f"{name}: {told}" for name, told in physics.items() if isinstance(told, str)]
+    errors = physics.get("errors") or {}
+    if errors:
+        worth = ", ".join(f"{name} {100 * error:.2f}" for name, error in errors.items())
+        out.append(f"worth in cross-validation (cm): {worth}")
+    return out

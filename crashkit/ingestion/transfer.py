@@ -46,14 +46,9 @@ Block = NDArray[Any]
 class Layout:
     """What all runs of the dataset share.
 
-    Attributes
-    ----------
-    structure
-        In metres, its order of nodes, faces and cells is the dataset's.
-    time
-        (state,) s.
-    one_shape
-        Whether all runs have the structure's reference positions.
+    structure  in metres, its order of nodes, faces and cells is the dataset's
+    time       (state,) s
+    one_shape  whether all runs have the structure's reference positions
     """
 
     choice: Choice
@@ -98,12 +93,7 @@ def _reference_spec(nodes: int) -> ArraySpec:
 def transfer(found: Found, layout: Layout, key: str, place: Path) -> StagedRun:
     """Read the run `found` and write its arrays into a Zarr store at `place`, whole or not at all.
 
-    Raises
-    ------
-    CrashkitError
-        Naming file, state and node of what is wrong.
-    OSError
-        If the disk is full.
+    Raises CrashkitError naming file, state and node of what is wrong, OSError if the disk is full.
     """
     beside = place.with_name(f"{place.name}.{os.getpid()}")
     beside.parent.mkdir(exist_ok=True)

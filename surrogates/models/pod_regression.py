@@ -1,15 +1,16 @@
 """POD with Gaussian processes or radial basis functions: what an engineer would use instead of a network.
 
-Two views of the same coefficients compete on validation runs: `trajectory`, where a run is one sample and its whole
-course of coefficients the answer, and `point`, where every state is a sample and the time one more input. The number of
-modes is chosen there as well; then everything is fitted again to all training runs.
+Two views of the same coefficients compete: `trajectory`, where a run is one sample and its whole course of coefficients
+the answer, and `point`, where every state is a sample and the time one more input. View, number of modes and what is
+known of the crash beforehand (`surrogates.physics`) are chosen by cross-validation over the training runs; then
+everything is fitted again to all of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -17,18 +18,23 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from surrogates.data.campaign import Campaign
-from surrogates.data.samples import Notes, Runs, Split, scale_of
+from surrogates.data.inputs import over_range
+from surrogates.data.samples import Notes, scale_of
 from surrogates.errors import SurrogateError
-from surrogates.reductions.pod import Pod, pod
+from surrogates.physics.choice import Worth, choose
+from surrogates.physics.registration import Registration
+from surrogates.physics.trials import Courses, Folds, Machine, Trials, course_machine, courses_of
 from surrogates.regression.gaussian import Gaussian, RadialBasis
 from surrogates.settings import Settings
-
-if TYPE_CHECKING:
-    pass
 
 Inputs = Literal["trajectory", "point"]
 # Share of the time steps' length below which two times are the same.
 _SAME_TIME = 1e-6
+# Fewer modes than this are those of the POD alone; else the first three move the structure as a whole, exactly.
+_WITH_TRANSLATIONS = 8
+_TRANSLATIONS = 3
+# Another view or number of modes is chosen if it lowers the error by this share.
+_MARGIN = 0.001
 
 
 @dataclass
@@ -41,7 +47,7 @@ class Coefficients:
 
     parameters: NDArray[np.float64]
     time: NDArray[np.float64]
-    values: NDArray[np.float64]
+    values: NDArray[np.float32]
 
 
 class PodRegression:
@@ -55,7 +61,7 @@ class PodRegression:
         self,
         modes: NDArray[np.float32],
         data: Coefficients,
-        machine: Gaussian | RadialBasis,
+        machine: Machine,
         inputs: Inputs,
         low: NDArray[np.float64],
         high: NDArray[np.float64],
@@ -73,24 +79,24 @@ class PodRegression:
 
     def coefficients(self, parameters: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float64]:
         """(run, p) and (state,), s -> (run, state, mode), m. Between trained times the course is interpolated."""
-        x = scaled(parameters, self.low, self.high)
+        x = self._scaled(parameters)
         r = self.modes.shape[1]
         if self.inputs == "trajectory":
             known = self.data.values.reshape(len(self.data.values), -1)
-            mean = known.mean(axis=0)
-            weights = self.machine.weights(x)
-            if isinstance(self.machine, Gaussian):
-                course = mean + weights @ (known - mean)
-            else:
-                course = weights @ known
+            course = self.machine.weights(x) @ known
             return _at(course.reshape(len(x), -1, r), self.data.time, time)
         points = np.concatenate(
             [np.repeat(x, len(time), axis=0), np.tile(_scaled_time(time, self.data.time), len(x))[:, None]], axis=1
         )
         known = self.data.values.reshape(-1, r)[self.samples]
-        mean = known.mean(axis=0) if isinstance(self.machine, Gaussian) else 0.0
-        out = np.concatenate([mean + self.machine.weights(p) @ (known - mean) for p in _pieces(points)])
+        out = np.concatenate([self.machine.weights(p) @ known for p in _pieces(points)])
         return out.reshape(len(x), len(time), r)
+
+    def deviation(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(run, p) -> (run,): what the process believes its error to be, up to a factor; ones where it believes nothing."""
+        if self.inputs == "trajectory" and isinstance(self.machine, Gaussian):
+            return self.machine.deviation(self._scaled(parameters))
+        return np.ones(len(parameters))
 
     def displacement(
         self, parameters: NDArray[np.float64], time: NDArray[np.float64], number: int = 0
@@ -98,13 +104,6 @@ class PodRegression:
         """(run, p) and (state,) -> (run, state, node, 3), m"""
         z = self.coefficients(parameters, time).astype(np.float32)
         return (z.reshape(-1, z.shape[-1]) @ self.modes.T).reshape(*z.shape[:2], -1, 3)
-
-    def truncated(self, count: int) -> PodRegression:
-        """The same with the first `count` modes only."""
-        values = np.ascontiguousarray(self.data.values[..., :count])
-        data = Coefficients(self.data.parameters, self.data.time, values)
-        modes = np.ascontiguousarray(self.modes[:, :count])
-        return PodRegression(modes, data, self.machine, self.inputs, self.low, self.high, self.samples)
 
     def reconstruct(self, states: NDArray[np.float32], number: int = 0) -> NDArray[np.float32]:
         """(state, node, 3) projected on the modes."""
@@ -132,98 +131,199 @@ class PodRegression:
         data = Coefficients(a["parameters"], a["time"], a["values"])
         samples = a.get("samples")
         x = data.parameters if inputs == "trajectory" else _points(data)[samples]
-        machine = Gaussian(x, a["theta"]) if model == "pod-gpr" else RadialBasis(x)
+        machine = Gaussian.load(x, a) if model == "pod-gpr" else RadialBasis(x)
         return cls(a["modes"], data, machine, inputs, a["low"], a["high"], samples)
+
+    def _scaled(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+        return over_range(parameters, np.stack([self.low, self.high]))
 
 
 @dataclass
 class Choice:
-    """What validation said: e2 (m) of each candidate, and the chosen one."""
+    """What cross-validation said: e2 (m) of each candidate, and the chosen one."""
 
     inputs: Inputs
     modes: int
     errors: dict[str, float] = field(default_factory=dict)
 
 
-def fit_pod_regression(
-    campaign: Campaign, settings: Settings, split: Split, notes: Notes
-) -> tuple[PodRegression, PodRegression | None, Choice]:
-    """Choose inputs and modes on the validation runs, then fit to all training runs.
+@dataclass
+class PodFit:
+    """A fitted POD regression of the registered campaign, and how it was chosen.
 
-    Returns the model, the one that was judged on the validation runs (None without any), and the choice.
+    held  calls back with each training run and what the model made without it says of it
     """
-    runs = Runs(campaign, 0, settings, notes)
-    everything = np.sort(np.concatenate([split.training, split.validation]))
-    views: tuple[Inputs, ...] = ("trajectory", "point") if settings.pod.inputs == "auto" else (settings.pod.inputs,)
-    wanted = tuple(sorted(settings.pod.modes))
-    if not len(split.validation):
-        choice = Choice(views[0], wanted[-1])
-        notes.add(f"without validation runs {choice.modes} modes and {choice.inputs} inputs are taken unseen")
-        return _fitted(campaign, settings, runs, everything, choice.inputs, choice.modes), None, choice
-    errors: dict[str, float] = {}
-    best: tuple[float, PodRegression] | None = None
-    basis = _basis(runs, split.training, wanted[-1])
-    for view in views:
-        model = _fitted(campaign, settings, runs, split.training, view, wanted[-1], basis)
-        z = model.coefficients(campaign.parameters[split.validation], campaign.time).astype(np.float32)
-        counts = sorted({min(m, z.shape[-1]) for m in wanted})
-        for count, error in zip(counts, _errors(model, z, runs, split.validation, counts), strict=True):
-            errors[f"{view}, {count} modes"] = error
-            if best is None or error < best[0]:
-                best = (error, model.truncated(count))
-    if best is None:
-        raise SurrogateError("pod.modes is empty; give at least one number of modes")
-    choice = Choice(best[1].inputs, best[1].latent(0), errors)
-    return _fitted(campaign, settings, runs, everything, choice.inputs, choice.modes), best[1], choice
+
+    core: PodRegression
+    registration: Registration
+    choice: Choice
+    worth: Worth
+    held: Callable[[], Iterator[Held]]
 
 
-def scaled(values: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(run, p) -> [-1, 1] over [low, high], without the columns where these agree."""
-    moves = high > low
-    return 2 * (np.atleast_2d(values)[:, moves] - low[moves]) / (high - low)[moves] - 1
+@dataclass(frozen=True)
+class Held:
+    """One training run as the others predict it: its place, displacements (state, node, 3), m, and the belief's deviation."""
+
+    run: int
+    predicted: NDArray[np.float32]
+    deviation: float
 
 
-def _basis(runs: Runs, chosen: NDArray[np.int64], count: int) -> Pod:
-    basis = pod((runs.read(run) for run in chosen), count)
-    scale_of(float(basis.singular_values[0]))
-    return basis
-
-
-def _fitted(
+def fit_pod_regression(
     campaign: Campaign,
     settings: Settings,
-    runs: Runs,
     chosen: NDArray[np.int64],
-    inputs: Inputs,
-    count: int,
-    basis: Pod | None = None,
-) -> PodRegression:
-    basis = basis or _basis(runs, chosen, count)
-    parameters = campaign.parameters[chosen]
-    low, high = parameters.min(axis=0), parameters.max(axis=0)
-    values = np.stack([basis.coefficients(runs.read(run)) for run in chosen]).astype(np.float64)
-    data = Coefficients(scaled(parameters, low, high), campaign.time.astype(np.float64), values)
-    samples = None
-    x, y = data.parameters, values.reshape(len(chosen), -1)
-    if inputs == "point":
-        points = _points(data)
-        samples = np.sort(np.random.default_rng(settings.seed).permutation(len(points))[: settings.pod.points])
-        x, y = points[samples], values.reshape(len(points), -1)[samples]
-    machine = (Gaussian(x) if settings.model == "pod-gpr" else RadialBasis(x)).fit(y, settings.seed)
-    return PodRegression(basis.modes, data, machine, inputs, low, high, samples)
+    notes: Notes,
+    report: Callable[[str], None] = lambda line: None,
+) -> PodFit:
+    """Choose registration, view and modes by folds of the runs `chosen`, then fit to all of them."""
+    if not settings.pod.modes:
+        raise SurrogateError("pod.modes is empty; give at least one number of modes")
+    courses = courses_of(campaign, settings, chosen, notes)
+    scale_of(float(np.square(courses.own, dtype=np.float64).sum()))
+    folds = _folds(campaign, settings, chosen)
+    trials = Trials(courses, campaign.parameters[chosen], folds, settings.model, settings.seed)
+    registration, plane, worth = choose(campaign, chosen, settings, trials, report)
+    candidates = [_Candidate("trajectory", registration, plane)]
+    if settings.pod.inputs == "point":
+        candidates = [_Candidate("point", Registration.identity(campaign.parameter_names, courses.time), 0)]
+    elif settings.pod.inputs == "auto" and registration.is_identity:
+        candidates.append(_Candidate("point", registration, 0))
+    counts = tuple(sorted({min(m, courses.own.shape[2]) for m in settings.pod.modes}))
+    if not folds.count:
+        best, count, errors = candidates[0], counts[-1], {}
+        notes.add(
+            f"{len(chosen)} runs cannot be told apart by folds; {count} modes and {best.view} inputs are taken unseen"
+        )
+    else:
+        report("number of modes")
+        errors = {c: _errors(c, trials, settings, counts) for c in candidates}
+        best, count = _best(errors, counts)
+    choice = Choice(best.view, count, _named(errors, counts))
+    core = _fitted(best, trials, settings, count)
+    return PodFit(core, best.registration, choice, worth, lambda: _held(best, trials, settings, count))
 
 
-def _errors(
-    model: PodRegression, z: NDArray[np.float32], runs: Runs, chosen: NDArray[np.int64], counts: Iterable[int]
-) -> list[float]:
-    """e2 (m) over the runs `chosen` with the first 1, 2, .. `counts` modes; z (run, state, mode)."""
-    total = np.zeros(len(list(counts)))
-    for k, run in enumerate(chosen):
-        truth = runs.read(run).reshape(runs.states, -1)
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    view: Inputs
+    registration: Registration
+    plane: int
+
+
+def _folds(campaign: Campaign, settings: Settings, chosen: NDArray[np.int64]) -> Folds:
+    """The folds of the settings; runs named for validation are the only ones left out."""
+    names = settings.validation.runs
+    if names:
+        named = np.array([campaign.runs[run] in names for run in chosen])
+        return Folds(np.where(named, 0, -1))
+    return Folds.of(len(chosen), settings.validation.folds, settings.seed)
+
+
+def _errors(candidate: _Candidate, trials: Trials, settings: Settings, counts: Sequence[int]) -> NDArray[np.float64]:
+    """(count,) e2 (m) over the left-out runs with so many modes, each fold with modes of its own."""
+    total, runs = np.zeros(len(counts)), 0
+    for part, held, course in _fold_courses(candidate, trials, settings):
+        turn = _rotation(part, max(counts))
         for place, count in enumerate(counts):
-            wrong = z[k, :, :count] @ model.modes[:, :count].T - truth
-            total[place] += np.linalg.norm(wrong.reshape(runs.states, -1, 3), axis=2).mean()
-    return (total / len(chosen)).tolist()
+            some = turn(count)
+            total[place] += trials.distances(held, np.asarray((course @ some) @ some.T, np.float32)).sum()
+        runs += len(held)
+    return total / max(1, runs)
+
+
+def _fold_courses(
+    candidate: _Candidate, trials: Trials, settings: Settings
+) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32]]]:
+    """Of each fold: courses that trained, places of the runs left out, and their predicted courses (run, state, mode)."""
+    if candidate.view == "trajectory":
+        values = trials.values(candidate.registration, candidate.plane)
+        splits = [trials.with_images(candidate.registration, train) for train, _ in trials.folds]
+        found = trials.predicted(candidate.registration, candidate.plane)
+        for part, (held, course) in zip(splits, found, strict=True):
+            yield values[part], held, course
+        return
+    for train, held in trials.folds:
+        core = _points_fitted(trials.courses, trials.parameters[train], train, settings)
+        states = core.coefficients(trials.parameters[held], trials.courses.time)
+        yield trials.courses.own[train], held, states.astype(np.float32)
+
+
+def _best(errors: Mapping[_Candidate, NDArray[np.float64]], counts: Sequence[int]) -> tuple[_Candidate, int]:
+    """The candidate and the fewest modes that no other beats by more than the margin."""
+    lowest = min(float(e.min()) for e in errors.values())
+    for candidate, found in errors.items():
+        good = np.flatnonzero(found <= lowest * (1 + _MARGIN))
+        if len(good):
+            return candidate, counts[int(good[0])]
+    raise SurrogateError("the errors of cross-validation are not finite; check the displacements")
+
+
+def _named(errors: Mapping[_Candidate, NDArray[np.float64]], counts: Sequence[int]) -> dict[str, float]:
+    return {
+        f"{candidate.view}, {count} modes": float(error)
+        for candidate, found in errors.items()
+        for count, error in zip(counts, found, strict=True)
+    }
+
+
+def _fitted(candidate: _Candidate, trials: Trials, settings: Settings, count: int) -> PodRegression:
+    courses, registration = trials.courses, candidate.registration
+    if candidate.view == "point":
+        core = _points_fitted(courses, trials.parameters, np.arange(len(trials.parameters)), settings)
+        turn = _rotation(courses.own, count)(count)
+    else:
+        inputs, values = trials.inputs(registration), trials.values(registration, candidate.plane)
+        machine = course_machine(settings.model, inputs, values, registration.inputs.mixed, settings.seed)
+        turn = _rotation(values, count)(count)
+        data = Coefficients(over_range(inputs, inputs), registration.grid, values)
+        core = PodRegression(courses.modes, data, machine, "trajectory", inputs.min(axis=0), inputs.max(axis=0))
+    core.modes = np.ascontiguousarray(courses.modes @ turn)
+    core.data.values = np.ascontiguousarray(core.data.values @ turn)
+    return core
+
+
+def _points_fitted(
+    courses: Courses, parameters: NDArray[np.float64], runs: NDArray[np.int64], settings: Settings
+) -> PodRegression:
+    """Every state a sample, on the common basis."""
+    low, high = parameters.min(axis=0), parameters.max(axis=0)
+    data = Coefficients(over_range(parameters, parameters), courses.time, courses.own[runs])
+    points = _points(data)
+    samples = np.sort(np.random.default_rng(settings.seed).permutation(len(points))[: settings.pod.points])
+    x, y = points[samples], data.values.reshape(len(points), -1)[samples].astype(np.float64)
+    machine: Machine = RadialBasis(x) if settings.model == "pod-rbf" else Gaussian(x).fit(y, settings.seed)
+    return PodRegression(courses.modes, data, machine, "point", low, high, samples)
+
+
+def _rotation(values: NDArray[np.float32], largest: int) -> Callable[[int], NDArray[np.float32]]:
+    """From the common basis to the first modes of courses (run, state, mode): count -> (mode, count), orthonormal.
+
+    From a few modes on, the structure's translations are the first ones, so that a motion as a whole is kept exactly.
+    """
+    flat = values.reshape(-1, values.shape[2])
+    gram = (flat.T @ flat).astype(np.float64)
+    alone = np.linalg.eigh(gram)[1][:, ::-1]
+    beside = np.zeros_like(alone)
+    beside[:_TRANSLATIONS, :_TRANSLATIONS] = np.eye(_TRANSLATIONS)
+    rest = np.linalg.eigh(gram[_TRANSLATIONS:, _TRANSLATIONS:])[1][:, ::-1]
+    beside[_TRANSLATIONS:, _TRANSLATIONS:] = rest
+
+    def first(count: int) -> NDArray[np.float32]:
+        return (beside if count >= _WITH_TRANSLATIONS else alone)[:, :count].astype(np.float32)
+
+    return first
+
+
+def _held(candidate: _Candidate, trials: Trials, settings: Settings, count: int) -> Iterator[Held]:
+    deviations = trials.deviations(candidate.registration, candidate.plane) if candidate.view == "trajectory" else None
+    for part, held, course in _fold_courses(candidate, trials, settings):
+        turn = _rotation(part, count)(count)
+        modes = (trials.courses.modes @ turn).astype(np.float32)
+        for run, states in zip(held, course @ turn, strict=True):
+            deviation = 1.0 if deviations is None else float(deviations[run])
+            yield Held(int(run), (states @ modes.T).reshape(len(states), -1, 3), deviation)
 
 
 def _points(data: Coefficients) -> NDArray[np.float64]:

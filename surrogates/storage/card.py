@@ -16,6 +16,7 @@ def card(surrogate: Surrogate) -> str:
     record, settings = surrogate.record, surrogate.settings
     ranges = record.ranges
     names = " -> ".join(surrogate.level_names)
+    by_folds = settings.model in ("pod-gpr", "pod-rbf")
     lines = [
         f"# {names}",
         "",
@@ -36,6 +37,7 @@ def card(surrogate: Surrogate) -> str:
         "Numbers given to `crashkit predict` without a unit are in these units. Outside these ranges predictions are",
         "extrapolations: `crashkit predict` says so, and refuses those far outside without `--extrapolate`.",
         "",
+        *_physics(surrogate),
         "## Levels",
         "",
         *_table(
@@ -43,10 +45,16 @@ def card(surrogate: Surrogate) -> str:
             [_level_row(surrogate, name, number) for name, number in surrogate.level_names.items()],
         ),
         "",
-        "## Errors on validation runs",
-        "",
+        *(("## Errors in cross-validation", "") if by_folds else ("## Errors on validation runs", "")),
     ]
-    if record.errors:
+    if record.errors and by_folds:
+        lines += [
+            "Mean distance between true and predicted nodes over nodes, states and training runs, each run predicted by a model",
+            "that was fitted without it. The number of modes was chosen by these errors, so test runs may be a little worse.",
+            "",
+            *_table(("measured", "error (cm)"), [(k, f"{100 * v:.3f}") for k, v in record.errors.items()]),
+        ]
+    elif record.errors:
         lines += [
             "Mean distance between true and predicted nodes over nodes, states and validation runs, on each level's own",
             "nodes unless lifted. Validation runs chose the weights kept (or the number of modes), so test runs may be worse.",
@@ -67,7 +75,8 @@ def card(surrogate: Surrogate) -> str:
     if record.notes:
         lines += ["## Notes", "", *(f"- {note}" for note in record.notes), ""]
     if record.choice:
-        lines += [f"Chosen on validation runs: {', '.join(f'{k} {v}' for k, v in record.choice.items())}.", ""]
+        how = "by cross-validation" if by_folds else "on validation runs"
+        lines += [f"Chosen {how}: {', '.join(f'{k} {v}' for k, v in record.choice.items())}.", ""]
     lines += [
         "## Settings",
         "",
@@ -79,6 +88,27 @@ def card(surrogate: Surrogate) -> str:
         "",
     ]
     return "\n".join(lines)
+
+
+def _physics(surrogate: Surrogate) -> list[str]:
+    """What the surrogate knows before the first run, and what it was worth."""
+    physics = surrogate.record.physics
+    if not physics:
+        return []
+    mirror = surrogate.registration.symmetry.mirror
+    out = ["## Known before the first run", ""]
+    out += [f"- {name}: {told}" for name, told in physics.items() if isinstance(told, str)]
+    if mirror is not None:
+        out.append(f"- {mirror.told}")
+    errors = physics.get("errors") or {}
+    if errors:
+        out += [
+            "",
+            "What each is worth: error of a process over whole runs in cross-validation over the training runs, on all modes.",
+            "",
+            *_table(("with", "error (cm)"), [(k, f"{100 * v:.3f}") for k, v in errors.items()]),
+        ]
+    return [*out, ""]
 
 
 def _bands(surrogate: Surrogate) -> list[str]:

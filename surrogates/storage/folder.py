@@ -38,13 +38,14 @@ from surrogates.models.base import Network, take_over
 from surrogates.models.cascade import Cascade, build_level
 from surrogates.models.pod_regression import PodRegression
 from surrogates.models.unified import Unified
+from surrogates.physics.registration import Registration
 from surrogates.record import Record, record_as_dict, record_from_dict
 from surrogates.settings import Settings, parse
 from surrogates.storage.card import card
 from surrogates.surrogate import Surrogate
 from surrogates.uncertainty import Band
 
-FORMAT = 1
+FORMAT = 2
 _MAIN = "model.json"
 _LABELS = ("node_id", "face_part", "part_id", "face_id")
 
@@ -94,13 +95,14 @@ def load(folder: str | Path) -> Surrogate:
         stored = load_file(folder / "graphs.safetensors")
         graphs, points, faces = _graphs(stored)
         core = _core(folder, about, settings, record, graphs)
+        registration = Registration.from_dict(about["registration"])
         bands = _bands(load_file(folder / "bands.safetensors"), record)
         labels = _labels(stored, about)
     except ModelFolderError:
         raise
     except (SurrogateError, SafetensorError, KeyError, TypeError, ValueError, IndexError) as error:
         raise ModelFolderError(f"{folder}: does not hold together ({error}); train it again") from error
-    surrogate = Surrogate(settings, record, graphs, core, points, faces)
+    surrogate = Surrogate(settings, record, graphs, core, points, faces, registration)
     surrogate.bands = bands
     surrogate.labels = labels
     return surrogate
@@ -121,6 +123,7 @@ def _write(surrogate: Surrogate, folder: Path) -> None:
         "format": FORMAT,
         "settings": surrogate.settings.as_dict(),
         "record": _plain(record_as_dict(record)),
+        "registration": _plain(surrogate.registration.as_dict()),
         "levels": [
             {"number": k, "name": name, "nodes": surrogate.graphs.n_nodes(k), "scale": _scale(core, k)}
             for name, k in surrogate.level_names.items()

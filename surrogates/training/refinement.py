@@ -21,12 +21,8 @@ from surrogates.errors import SurrogateError
 class Refined:
     """Graphs whose levels finer than `number` are still those of the hierarchy.
 
-    Attributes
-    ----------
-    places
-        (node of level `number`,) where its nodes stand among those of the hierarchy's level.
-    spread
-        csr (node of the hierarchy's level, node of level `number`): interpolation to all of them.
+    places     (node of level `number`,) where its nodes stand among those of the hierarchy's level
+    spread     csr (node of the hierarchy's level, node of level `number`): interpolation to all of them
     """
 
     hierarchy: Graphs

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from surrogates.data.campaign import Campaign
 from surrogates.data.graphs import Graphs
 from surrogates.data.inputs import InputScaling, Ranges
-from surrogates.data.samples import Notes, Runs, check, split
+from surrogates.data.samples import Notes, Runs, check, everything, split
 from surrogates.errors import SurrogateError
 from surrogates.models.cascade import Cascade
 from surrogates.models.pod_regression import fit_pod_regression
@@ -46,7 +46,8 @@ def train(
     """
     notes = Notes()
     check(campaign, settings, notes)
-    parts = split(campaign, settings, notes)
+    by_folds = settings.model in ("pod-gpr", "pod-rbf")
+    parts = everything(campaign, settings) if by_folds else split(campaign, settings, notes)
     graphs = Graphs.of(campaign)
     ranges = Ranges.of(
         campaign.parameter_names, campaign.parameter_units, campaign.parameters[parts.training], campaign.time,
@@ -57,7 +58,7 @@ def train(
     record.notes = notes.lines
     surrogate = Surrogate(settings, record, graphs, Cascade(scaling(settings, ranges)), campaign.points, campaign.faces)
     surrogate.labels = campaign.labels
-    if settings.model in ("pod-gpr", "pod-rbf"):
+    if by_folds:
         _fit_regression(surrogate, trainer)
     elif settings.unified:
         _fit_unified(surrogate, trainer)
@@ -82,18 +83,18 @@ def level_numbers(settings: Settings, graphs: Graphs) -> tuple[int, ...]:
 
 
 def _fit_regression(surrogate: Surrogate, trainer: Trainer) -> None:
+    """Everything is chosen by folds, and the errors and the band come from the runs each fold left out."""
     started = time.perf_counter()
-    campaign, held = trainer.campaign, trainer.split.validation
-    core, judged, choice = fit_pod_regression(campaign, trainer.settings, trainer.split, trainer.notes)
-    if judged is not None:  # the band comes from the model that has not seen the validation runs
-        surrogate.core = judged
-        runs = trainer.runs(0, surrogate.graphs)
-        distances = [_distance(_predicted(surrogate, campaign, run, 0), runs.read(run)) for run in held]
-        _note(surrogate, next(iter(surrogate.level_names)), 0, distances, [])
-    surrogate.core = core
-    surrogate.record.fits[0] = Fit(seconds=time.perf_counter() - started)
-    surrogate.record.choice = {"inputs": choice.inputs, "modes": choice.modes}
-    surrogate.record.errors |= choice.errors
+    campaign, record, runs = trainer.campaign, surrogate.record, trainer.split.training
+    found = fit_pod_regression(campaign, trainer.settings, runs, trainer.notes)
+    surrogate.core, surrogate.registration = found.core, found.registration
+    record.choice = {"inputs": found.choice.inputs, "modes": found.choice.modes}
+    record.physics = {**found.registration.told(), "errors": found.worth.errors}
+    field = trainer.runs(0, surrogate.graphs)
+    distances = [_distance(held.predicted, field.read(runs[held.run])) for held in found.held()]
+    _note(surrogate, next(iter(surrogate.level_names)), 0, distances, [])
+    record.errors |= found.choice.errors
+    record.fits[0] = Fit(seconds=time.perf_counter() - started)
 
 
 def _fit_unified(surrogate: Surrogate, trainer: Trainer) -> None:
