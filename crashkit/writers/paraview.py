@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crashkit.errors import DataError, OutputError, ReadError
+from crashkit.writers.paraview_view import Ranges, view_script
 
 if TYPE_CHECKING:
     import h5py
@@ -34,12 +35,15 @@ if TYPE_CHECKING:
 SUFFIXES = (".pvd", ".vtkhdf", ".vtu", ".vtp")
 
 Arrays = Mapping[str, NDArray[Any]]
+_Steps = Iterator[tuple["State", NDArray[Any]]]
 
 # zlib level 1: levels above cost time and win next to nothing on floating point numbers.
 _COMPRESSION = 1
 _VTK_LINE, _VTK_TRIANGLE, _VTK_QUAD = 3, 5, 9
 _COMPONENTS = 9  # of a full tensor, the widest array there is
 _HIDDEN_CELL = 32  # vtkDataSetAttributes::HIDDENCELL
+# Sizes of the mesh from the origin up to which single precision keeps points to a millionth of the mesh.
+_FAR = 10
 
 
 @dataclass(frozen=True)
@@ -65,6 +69,7 @@ def write_paraview(
     units: Mapping[str, str] | None = None,
     alive: Any | None = None,
     deform: bool = False,
+    field_data: Mapping[str, Any] | None = None,
 ) -> list[Path]:
     """Write the states of one run to `path`, for ParaView, PyVista and everything else that reads VTK files.
 
@@ -82,6 +87,10 @@ def write_paraview(
     alive       (t, m) bool, False once an element has eroded: becomes the cell array `alive`, and VTK's ghost
                 array, so that eroded elements are not drawn
     deform      move the points by the array `displacement`. Nodes where it is NaN stay where they were last.
+    field_data  what belongs to the file as a whole: name -> number, text, or a row of either
+
+    Beside a `.pvd` or `.vtkhdf` file stands `NAME_view.py`, which ParaView loads as a state (File > Load State): the
+    warped mesh, coloured over one range for all states.
 
     Returns the files written, the one to open first. Raises DataError where arrays and mesh do not belong
     together, OutputError where `path` cannot be written.
@@ -103,7 +112,8 @@ def write_paraview(
                 cells |= _life(alive[k], mesh)
             yield State({name: np.asarray(values[k]) for name, values in moving_points.items()}, cells)
 
-    return _write(path, mesh, times, states(), State(fixed_points, fixed_cells), units or {}, deform)
+    constant = State(fixed_points, fixed_cells)
+    return _write(path, mesh, times, states(), constant, _Extras(units or {}, _field_data(field_data or {})), deform)
 
 
 def write_states(
@@ -116,6 +126,7 @@ def write_states(
     lines: ArrayLike | None = None,
     units: Mapping[str, str] | None = None,
     deform: bool = False,
+    field_data: Mapping[str, Any] | None = None,
 ) -> list[Path]:
     """The same as `write_paraview` for states that come one after the other: only one is held in memory.
 
@@ -126,7 +137,8 @@ def write_states(
     behind then.
     """
     mesh = _mesh(points, faces, lines)
-    return _write(path, mesh, _times(time), states, constant or State({}), units or {}, deform)
+    extras = _Extras(units or {}, _field_data(field_data or {}))
+    return _write(path, mesh, _times(time), states, constant or State({}), extras, deform)
 
 
 def read_state(path: str | os.PathLike[str], state: int = -1) -> tuple[float, Any]:
@@ -160,7 +172,43 @@ def read_state(path: str | os.PathLike[str], state: int = -1) -> tuple[float, An
     return time, pv.wrap(reader.GetOutputDataObject(0))
 
 
+def rounded(values: NDArray[np.floating], size: float) -> NDArray[np.float32]:
+    """`values` to about 1/65000 of `size`, both in m, as single precision numbers that compress to two thirds.
+
+    Predictions carry noise in their last digits, far below their error, which takes most of the space in a file.
+    """
+    if not size > 0:
+        return np.asarray(values, np.float32)
+    step = np.float32(2.0 ** np.floor(np.log2(2e-5 * size)))
+    return np.round(np.asarray(values, np.float32) / step) * step
+
+
 # --- what is written -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Extras:
+    """What stands beside the arrays: their units, and field data as numbers (k,) or texts."""
+
+    units: Mapping[str, str]
+    field_data: Mapping[str, NDArray[Any] | list[str]]
+
+
+def _field_data(given: Mapping[str, Any]) -> dict[str, NDArray[Any] | list[str]]:
+    out: dict[str, NDArray[Any] | list[str]] = {}
+    for name, value in given.items():
+        if not name or "/" in name or "." in name:
+            raise DataError(f"field data {name!r}: expected a name without '/' and '.'")
+        array = np.atleast_1d(np.asarray(value))
+        if array.dtype.kind in "UO":
+            out[name] = [str(text) for text in array]
+        elif array.dtype.kind in "iufb" and array.ndim == 1:
+            out[name] = array.astype(np.int64 if array.dtype.kind in "iub" else np.float64)
+        else:
+            raise DataError(
+                f"field data {name!r} is {array.dtype} of shape {array.shape}: expected a row of numbers or texts"
+            )
+    return out
 
 
 @dataclass(frozen=True)
@@ -191,6 +239,8 @@ def _mesh(points: ArrayLike, faces: ArrayLike, lines: ArrayLike | None) -> _Mesh
     xyz = xyz if xyz.dtype in (np.float32, np.float64) else xyz.astype(np.float64)
     if not np.isfinite(xyz).all():
         raise DataError(f"point {int(np.argmin(np.isfinite(xyz).all(axis=1)))} is not finite: expected positions in m")
+    if np.abs(xyz).max() <= _FAR * np.ptp(xyz, axis=0).max():
+        xyz = xyz.astype(np.float32)  # half the size; in VTU the points stand in every state
     corners, ends = np.asarray(faces), np.asarray(np.empty((0, 2), np.int64) if lines is None else lines)
     if corners.size == 0:
         corners = np.empty((0, 3), np.int64)
@@ -305,7 +355,7 @@ def _write(
     times: NDArray[np.float64],
     states: Iterable[State],
     constant: State,
-    units: Mapping[str, str],
+    extras: _Extras,
     deform: bool,
 ) -> list[Path]:
     target = Path(path)
@@ -317,18 +367,33 @@ def _write(
     if target.is_dir():
         raise OutputError(f"{target}: is a folder: expected the name of a file")
     constant = _checked(constant, mesh, "the constant arrays")
-    steps = _in_step(states, constant, mesh, times, deform)
+    ranges = Ranges()
+    ranges.note(constant.point_data, constant.cell_data)
+    steps = _followed(_in_step(states, constant, mesh, times, deform), ranges)
     with _output(target) as folder:
         if suffix == ".vtkhdf":
-            _write_vtkhdf(folder / target.name, mesh, times, steps, constant, units, deform)
+            _write_vtkhdf(folder / target.name, mesh, times, steps, constant, extras, deform)
+            others: list[Path] = []
         elif suffix == ".pvd":
-            return _write_pvd(folder, target, mesh, times, steps, constant, units)
+            others = _write_pvd(folder, target, mesh, times, steps, constant, extras)
         else:
-            write = _xml_writer(mesh, constant, units, polydata=suffix == ".vtp")
+            write = _xml_writer(mesh, constant, extras, polydata=suffix == ".vtp")
             for state, points in steps:
                 write(folder / target.name, float(times[0]), state, points)
+            (folder / target.name).replace(target)
+            return [target]
         (folder / target.name).replace(target)
-    return [target]
+        script = target.with_name(f"{target.stem}_view.py")
+        (folder / script.name).write_text(view_script(target.name, ranges, extras.units), encoding="utf-8")
+        (folder / script.name).replace(script)
+    return [target, *others, script]
+
+
+def _followed(steps: _Steps, ranges: Ranges) -> _Steps:
+    """`steps` as they are, and the ranges of what goes by are noted."""
+    for state, points in steps:
+        ranges.note(state.point_data, state.cell_data)
+        yield state, points
 
 
 @contextmanager
@@ -356,13 +421,13 @@ def _write_pvd(
     times: NDArray[np.float64],
     steps: Iterator[tuple[State, NDArray[Any]]],
     constant: State,
-    units: Mapping[str, str],
+    extras: _Extras,
 ) -> list[Path]:
     place = target.with_name(f"{target.stem}_states")
     digits = max(3, len(str(times.size - 1)))
     names = [f"{target.stem}_{k:0{digits}d}.vtu" for k in range(times.size)]
     _refuse_foreign(place, target.stem)
-    write = _xml_writer(mesh, constant, units)
+    write = _xml_writer(mesh, constant, extras)
     written = folder / "states"
     written.mkdir()
     root = ElementTree.Element("VTKFile", type="Collection", version="1.0", byte_order="LittleEndian")
@@ -377,8 +442,7 @@ def _write_pvd(
     if place.exists():
         place.rename(folder / "replaced")
     written.rename(place)
-    (folder / target.name).replace(target)
-    return [target, *(place / name for name in names)]
+    return [place / name for name in names]
 
 
 def _refuse_foreign(place: Path, stem: str) -> None:
@@ -394,10 +458,10 @@ def _refuse_foreign(place: Path, stem: str) -> None:
 _WriteState = Callable[[Path, float, State, NDArray[Any]], None]
 
 
-def _xml_writer(mesh: _Mesh, constant: State, units: Mapping[str, str], polydata: bool = False) -> _WriteState:
+def _xml_writer(mesh: _Mesh, constant: State, extras: _Extras, polydata: bool = False) -> _WriteState:
     """A function that writes one state; mesh and constant arrays are handed to VTK once."""
     from vtkmodules.util.numpy_support import numpy_to_vtk
-    from vtkmodules.vtkCommonCore import vtkDataArray, vtkPoints
+    from vtkmodules.vtkCommonCore import vtkDataArray, vtkPoints, vtkStringArray
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter, vtkXMLUnstructuredGridWriter
 
     grid, order = _vtk_polydata(mesh) if polydata else _vtk_grid(mesh)
@@ -405,8 +469,15 @@ def _xml_writer(mesh: _Mesh, constant: State, units: Mapping[str, str], polydata
     def add(attributes: Any, name: str, values: NDArray[Any]) -> None:
         array = numpy_to_vtk(values)
         array.SetName(name)
-        if name in units:
-            array.GetInformation().Set(vtkDataArray.UNITS_LABEL(), units[name])
+        if name in extras.units:
+            array.GetInformation().Set(vtkDataArray.UNITS_LABEL(), extras.units[name])
+        attributes.AddArray(array)
+
+    def add_texts(attributes: Any, name: str, texts: list[str]) -> None:
+        array = vtkStringArray()
+        array.SetName(name)
+        for text in texts:
+            array.InsertNextValue(text)
         attributes.AddArray(array)
 
     def write(path: Path, time: float, state: State, points: NDArray[Any]) -> None:
@@ -423,6 +494,11 @@ def _xml_writer(mesh: _Mesh, constant: State, units: Mapping[str, str], polydata
         if output.GetPointData().HasArray("displacement"):
             output.GetPointData().SetActiveVectors("displacement")
         add(output.GetFieldData(), "TimeValue", np.array([time]))
+        for name, about in extras.field_data.items():
+            if isinstance(about, list):
+                add_texts(output.GetFieldData(), name, about)
+            else:
+                add(output.GetFieldData(), name, about)
         writer = (vtkXMLPolyDataWriter if polydata else vtkXMLUnstructuredGridWriter)()
         problems: list[str] = []
         speaker: Any
@@ -494,7 +570,7 @@ def _write_vtkhdf(
     times: NDArray[np.float64],
     steps: Iterator[tuple[State, NDArray[Any]]],
     constant: State,
-    units: Mapping[str, str],
+    extras: _Extras,
     deform: bool,
 ) -> None:
     """One transient UnstructuredGrid: everything lies one behind the other, and `Steps` says where each state starts.
@@ -525,12 +601,14 @@ def _write_vtkhdf(
         _dataset(where, "CellOffsets", still[:, None])
         _dataset(where, "ConnectivityIdOffsets", still[:, None])
 
+        if extras.field_data:
+            _write_field_data(root, where, extras, t)
         groups = []
         for kind, arrays in (("PointData", constant.point_data), ("CellData", constant.cell_data)):
             group = root.create_group(kind, track_order=True)
             offsets = where.create_group(f"{kind}Offsets", track_order=True)
             for name, values in arrays.items():
-                _dataset(group, name, values, units.get(name))
+                _dataset(group, name, values, extras.units.get(name))
                 _dataset(offsets, name, still)
             groups.append((group, offsets))
 
@@ -539,7 +617,7 @@ def _write_vtkhdf(
                 moving = _grown(root, "Points", points, t) if deform else _dataset(root, "Points", points)
                 for (group, offsets), arrays in zip(groups, (state.point_data, state.cell_data), strict=True):
                     for name, values in arrays.items():
-                        _grown(group, name, values, t, units.get(name))
+                        _grown(group, name, values, t, extras.units.get(name))
                         _dataset(offsets, name, np.arange(t, dtype=np.int64) * len(values))
             if deform:
                 moving[k * n : (k + 1) * n] = points
@@ -548,6 +626,22 @@ def _write_vtkhdf(
                     group[name][k * len(values) : (k + 1) * len(values)] = values
             disk.check()
     disk.check()
+
+
+def _write_field_data(root: h5py.Group, where: h5py.Group, extras: _Extras, states: int) -> None:
+    """Field data that is the same in all states: every state starts at 0 and takes everything."""
+    import h5py
+
+    group = root.create_group("FieldData", track_order=True)
+    offsets, sizes = (where.create_group(f"FieldData{what}", track_order=True) for what in ("Offsets", "Sizes"))
+    for name, values in extras.field_data.items():
+        if isinstance(values, list):  # VTK reads texts of type ASCII alone, and takes their bytes for UTF-8
+            texts = np.array([text.encode() for text in values], object)
+            group.create_dataset(name, data=texts, dtype=h5py.string_dtype("ascii"))
+        else:
+            _dataset(group, name, values, extras.units.get(name))
+        _dataset(offsets, name, np.zeros(states, np.int64))
+        _dataset(sizes, name, np.tile(np.array([1, len(values)], np.int64), (states, 1)))
 
 
 class _Disk(FileIO):

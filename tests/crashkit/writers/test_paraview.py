@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import gc
 import resource
 import subprocess
@@ -282,3 +283,74 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, suffix):
     assert done.stdout.count("\n") == 1
     assert done.stderr == ""
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("suffix", [".pvd", ".vtkhdf", ".vtu"])
+def test_what_belongs_to_the_whole_file_comes_back_in_every_state(tmp_path, suffix):
+    about = {"impact_speed": 22.0, "model": "MH1 of mh", "part_name": ["floor", "Längsträger"], "part_ids": [7, 9]}
+    time = TIME[:1] if suffix == ".vtu" else TIME
+    u = np.zeros((len(time), 6, 3))
+    file = write_paraview(tmp_path / f"run{suffix}", POINTS, FACES, time, {"displacement": u}, field_data=about)[0]
+    states = [pv.read(file)] if suffix == ".vtu" else read(file)[1]
+    for mesh in states:
+        assert mesh.field_data["impact_speed"].tolist() == [22.0]
+        assert list(mesh.field_data["model"]) == ["MH1 of mh"]
+        assert list(mesh.field_data["part_name"]) == ["floor", "Längsträger"]
+        assert mesh.field_data["part_ids"].tolist() == [7, 9]
+
+
+class _Recorder:
+    """Stands in for paraview.simple: everything can be called, and calls are noted."""
+
+    def __init__(self, calls, name=""):
+        self._calls, self._name = calls, name
+
+    def __call__(self, *args, **named):
+        self._calls.append((self._name, args, named))
+        return _Recorder(self._calls, self._name)
+
+    def __getattr__(self, name):
+        return _Recorder(self._calls, name)
+
+
+@pytest.mark.parametrize("suffix", [".pvd", ".vtkhdf"])
+def test_the_script_beside_a_run_shows_it_in_colours_that_hold_for_all_states(tmp_path, suffix):
+    rng = np.random.default_rng(0)
+    u, error = rng.normal(size=(3, 6, 3)), rng.uniform(size=(3, 6))
+    error[1, 2] = np.nan
+    files = write_paraview(
+        tmp_path / f"run{suffix}", POINTS, FACES, TIME, {"displacement": u, "error": error, "node_id": np.arange(6)},
+        units={"error": "m"},
+    )  # fmt: skip
+    script = tmp_path / "run_view.py"
+    assert script in files
+    calls = []
+    names = "OpenDataFile WarpByVector GetActiveViewOrCreate Show ColorBy GetColorTransferFunction GetScalarBar"
+    names += " GetAnimationScene ResetCamera Render"
+    stand_in = {n: _Recorder(calls, n) for n in names.split()}
+    code = script.read_text(encoding="utf-8").replace("from paraview.simple import *", "")
+    exec(compile(code, str(script), "exec"), {**stand_in, "__file__": str(script)})
+    asked = {name: (args, named) for name, args, named in calls}
+    assert asked["OpenDataFile"][0] == (str(tmp_path / f"run{suffix}"),)
+    assert asked["WarpByVector"][1]["Vectors"] == ["POINTS", "displacement"]
+    assert asked["ColorBy"][0][1] == ("POINTS", "error")
+    low, high = asked["RescaleTransferFunction"][0]
+    assert (low, high) == (pytest.approx(np.nanmin(error)), pytest.approx(np.nanmax(error)))
+
+
+def test_names_of_strangers_do_nothing_in_the_script():
+    from crashkit.writers.paraview_view import Ranges, view_script
+
+    evil = "x'\nimport os; os.abort() #"
+    ranges = Ranges()
+    ranges.note({evil: np.ones((2, 3))}, {})
+    code = view_script(evil, ranges, {evil: evil})
+    names = [node.names[0].name for node in ast.walk(ast.parse(code)) if isinstance(node, ast.Import)]
+    assert names == ["os"]
+
+
+def test_points_far_from_the_origin_keep_their_precision(tmp_path):
+    far = POINTS + 1e6
+    for points, expected in ((POINTS, np.float32), (far, np.float64)):
+        file = write_paraview(tmp_path / "one.vtu", points, FACES, [0.0], {})[0]
+        assert pv.read(file).points.dtype == expected
