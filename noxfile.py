@@ -50,6 +50,13 @@ def docs(session: nox.Session) -> None:
 
 
 @nox.session(default=False)
+def mutants(session: nox.Session) -> None:
+    """Whether the tests notice small changes: `nox -s mutants -- crashkit/mesh/probe.py --sample 15 --seed 0`."""
+    install(session, "mutation")
+    session.run("python", "tools/mutate.py", *session.posargs)
+
+
+@nox.session(default=False)
 def build(session: nox.Session) -> None:
     """Wheel and source archive in `dist/`."""
     session.install("build")
