@@ -1,7 +1,8 @@
 """What a dataset holds, as one SHA-256: the same for Zarr and NetCDF, any chunking and any number of workers.
 
 A run's own checksum covers its results (displacement, `alive`, fields); the dataset's covers these, the runs'
-names and parameters, and everything the runs share. Attributes are left out: they tell how, not what.
+names and parameters, and everything the runs share: times, nodes, faces, cells and parts with their numbers and names.
+Attributes are left out: they tell how, not what.
 """
 
 from __future__ import annotations
@@ -14,10 +15,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from data_schema.layout import fields, parameters
+from data_schema.layout import VARIABLES, fields, parameters
 
 # Results are stored and hashed in blocks of all states and some nodes (faces, cells), of about this many bytes.
 BLOCK_BYTES = 8 << 20
+# They say again, for UGRID readers, what other variables say.
+_COPIES = ("mesh", "node_x", "node_y", "node_z")
 
 
 def blocks(states: int, length: int, entry_bytes: int) -> list[tuple[int, int]]:
@@ -89,6 +92,11 @@ def digests_of_run(dataset: xr.Dataset, sim: int) -> dict[str, str]:
     return {name: digest for name, digest in found.items() if digest is not None}
 
 
+def shared(dataset: xr.Dataset) -> list[str]:
+    """Names of the variables of the layout that all runs share, without those that only repeat others."""
+    return [n for n in VARIABLES if n in dataset.variables and "sim" not in dataset[n].dims and n not in _COPIES]
+
+
 def dataset_checksum(
     dataset: xr.Dataset,
     run_checksums: Iterable[str],
@@ -101,10 +109,11 @@ def dataset_checksum(
     reference = dataset.get("reference_position")
     if reference is not None and "sim" in reference.dims:
         positions = lambda k: reference.isel(sim=k).values  # noqa: E731
-    shared = ["time", "node_id", "face_nodes", "face_part", "part_id", "cell_nodes", "cell_type"]
-    if positions is None:
-        shared.append("reference_position")
-    lines = [f"{name} {_array(dataset[name].values)}" for name in shared if name in dataset.variables]
+    lines = [
+        f"{name} {_array(dataset[name].values)}"
+        for name in shared(dataset)
+        if positions is None or name != "reference_position"
+    ]
     names = sorted(parameters(dataset))
     for k, (run, checksum) in enumerate(zip(dataset["sim"].values, run_checksums, strict=True)):
         values = [f"{name}={float(dataset[name].values[k]).hex()}" for name in names]
@@ -114,8 +123,12 @@ def dataset_checksum(
 
 
 def _array(values: NDArray) -> str:
-    plain = values.astype("<f8" if values.dtype.kind == "f" else "<i8")
-    return hashlib.sha256(np.ascontiguousarray(plain).tobytes()).hexdigest()
+    """SHA-256 of shape and content, whatever the width of the numbers, or how text is kept."""
+    if values.dtype.kind in "OTU":
+        content = "\0".join(map(str, values.ravel())).encode()
+    else:
+        content = values.astype("<f8" if values.dtype.kind == "f" else "<i8").tobytes()
+    return hashlib.sha256(f"{values.shape}".encode() + content).hexdigest()
 
 
 def _of(lines: Iterable[str]) -> str:
