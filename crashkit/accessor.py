@@ -36,7 +36,10 @@ class CrashAccessor:
     def split(self, test: Selection, *, seed: int = 0) -> tuple[xr.Dataset, xr.Dataset]:
         """(training runs, test runs), each in the dataset's order; `test` as in `runs_of`.
 
-        Raises DataError if there is no such run, or if all runs would be test runs.
+        Raises
+        ------
+        DataError
+            If there is no such run, or if all runs would be test runs.
         """
         count = self._dataset.sizes["sim"]
         chosen = runs_of([str(n) for n in self._dataset["sim"].values], test, seed=seed)
@@ -59,7 +62,10 @@ class CrashAccessor:
     def nodes(self, part: str | int) -> NDArray[np.int64]:
         """Places of the nodes of a part (number, title or pattern), for `ds.isel(node=...)`, increasing.
 
-        Raises DataError if there is no such part.
+        Raises
+        ------
+        DataError
+            If there is no such part.
         """
         ds = self._dataset
         names = [str(n) for n in ds["part_name"].values]
@@ -91,12 +97,22 @@ class CrashAccessor:
     def to_pyvista(self, sim: int | str = 0, time: float | int = -1, *, deform: bool = True) -> pyvista.PolyData:
         """One state of one run as a surface with the displacement and all fields on nodes and faces.
 
-        sim     name of the run, or its place
-        time    place of the state (int), or seconds (float): the nearest state
-        deform  points where they are then; else the undeformed position
-
         Eroded faces are left out; nodes that nothing holds any more stay at their undeformed position, with NaN as
-        displacement. Raises DataError for a run that is not there.
+        displacement.
+
+        Parameters
+        ----------
+        sim
+            Name of the run, or its place.
+        time
+            Place of the state (int), or seconds (float): the nearest state.
+        deform
+            Points where they are then; else the undeformed position.
+
+        Raises
+        ------
+        DataError
+            For a run that is not there.
         """
         from data_schema import fields
 

@@ -27,10 +27,16 @@ if TYPE_CHECKING:
 def open_dataset(path: str | Path, *, chunks: Literal["stored"] | Mapping[str, int] | None = "stored") -> xr.Dataset:
     """The crash dataset at `path`, a `.zarr` folder or `.nc` file; values are read when they are asked for.
 
-    chunks  "stored": as Dask arrays in the chunks of the store, so that sums over all runs stay small in memory, or
-            without Dask where that is not installed; sizes by dimension for other chunks; None for no Dask
+    Parameters
+    ----------
+    chunks
+        "stored": as Dask arrays in the chunks of the store, so that sums over all runs stay small in memory, or
+        without Dask where that is not installed; sizes by dimension for other chunks; None for no Dask.
 
-    Raises ReadError if there is nothing, or nothing of the kind; `data_schema.validate` tells whether it is good.
+    Raises
+    ------
+    ReadError
+        If there is nothing, or nothing of the kind; `data_schema.validate` tells whether it is good.
     """
     path = Path(path)
     if not path.exists():

@@ -57,11 +57,15 @@ class CrashBackend(BackendEntrypoint):
     ) -> xr.Dataset:
         """One run as a dataset with one `sim`.
 
-        run    name or place of the run where the path holds several
-        units  unit system of the source; without, and where the source states none, values stay as they are and
-               variables carry no unit
-
         The other options are those of `crashkit.ingest`. Raises ReadError or DataError.
+
+        Parameters
+        ----------
+        run
+            Name or place of the run where the path holds several.
+        units
+            Unit system of the source; without, and where the source states none, values stay as they are and
+            variables carry no unit.
         """
         path = Path(filename_or_obj)
         if path.suffix in SUFFIXES and reader is None:

@@ -24,9 +24,15 @@ def refuse_earlier(output: Path, mark: str, what: str, option: str = "-o") -> No
 def complete_folder(output: Path, mark: str) -> Iterator[Path]:
     """A new folder beside `output` that takes its place when the block ends well, and vanishes otherwise.
 
-    mark  name of a file by which an earlier result is known: only such a folder, or an empty one, is replaced
+    Parameters
+    ----------
+    mark
+        Name of a file by which an earlier result is known: only such a folder, or an empty one, is replaced.
 
-    Raises OutputError where `output` is something else, or nothing can be written there.
+    Raises
+    ------
+    OutputError
+        Where `output` is something else, or nothing can be written there.
     """
     if output.exists() and not (output / mark).exists() and (not output.is_dir() or any(output.iterdir())):
         raise OutputError(

@@ -23,7 +23,10 @@ def runs_of(names: Sequence[str], chosen: Selection, *, seed: int = 0) -> list[i
     An int or a fraction below 1 draws that many at random (seeded); a slice or "27:36" means places; a list or
     "run_003,run_007" means names or places.
 
-    Raises DataError for a run that is not there, or a selection of nothing.
+    Raises
+    ------
+    DataError
+        For a run that is not there, or a selection of nothing.
     """
     count = len(names)
     place = {str(n): k for k, n in enumerate(names)}

@@ -33,9 +33,14 @@ _POOLED = 2000
 class Band:
     """Half-widths: at node i and state t the true node lies within `factor * node[i] * state[t]` of the predicted one.
 
-    node    (node,) m; state (state,) 1, at `time` (state,) s
-    factor  (share,) for the shares SHARES
-    runs    validation runs behind it
+    Attributes
+    ----------
+    node
+        (node,) m; state (state,) 1, at `time` (state,) s.
+    factor
+        (share,) for the shares SHARES.
+    runs
+        Validation runs behind it.
     """
 
     node: NDArray[np.float32]
@@ -47,7 +52,10 @@ class Band:
     def half_width(self, coverage: float, time: NDArray[np.float64]) -> NDArray[np.float32]:
         """(state, node), m, for the share `coverage` of nodes and states; between states it is interpolated.
 
-        Raises SurrogateError for a share it has no quantile for.
+        Raises
+        ------
+        SurrogateError
+            For a share it has no quantile for.
         """
         if not SHARES[0] <= coverage <= SHARES[-1]:
             raise SurrogateError(f"coverage {coverage} was asked for; expected {SHARES[0]:g} to {SHARES[-1]:g}")

@@ -123,14 +123,8 @@ def _mirrors(dataset: Any) -> tuple[Mirror, ...]:
 
 def _levels(path: Path) -> tuple[GraphLevel, ...]:
     """The hierarchy as the surrogates take it; empty where the dataset has none."""
-    from crashkit.errors import DataError
-    from crashkit.mesh.store import read_hierarchy
+    from crashkit.mesh.store import has_hierarchy, read_hierarchy
     from surrogates.data.campaign import GraphLevel
 
-    try:
-        stored = read_hierarchy(path).levels
-    except DataError as error:
-        if "has no mesh hierarchy" in str(error):
-            return ()
-        raise
+    stored = read_hierarchy(path).levels if has_hierarchy(path) else ()
     return tuple(GraphLevel(k.index, k.kept, k.faces, k.edges, k.in_finer, k.to_finer, k.to_full) for k in stored)

@@ -25,7 +25,12 @@ def coarsen(
     finer one (default 8, 4, 4). `pair_distance`, m: see `crashkit.mesh.build_hierarchy`. `report(done, runs)` follows
     the pass over the runs. An older hierarchy is replaced once the new one is complete.
 
-    Raises MeshError for counts that cannot be had, DataError, ReadError and OutputError for the files.
+    Raises
+    ------
+    MeshError
+        For counts that cannot be had.
+    DataError, ReadError, OutputError
+        For the files.
     """
     from crashkit.errors import MeshError
     from crashkit.mesh.hierarchy import build_hierarchy, ratios_to_counts

@@ -15,7 +15,10 @@ if TYPE_CHECKING:
 def describe_dataset(dataset: xr.Dataset, path: Path) -> dict[str, Any]:
     """The facts about the dataset at `path` in SI units; reads the displacements once, block by block.
 
-    Raises ReadError if values cannot be read.
+    Raises
+    ------
+    ReadError
+        If values cannot be read.
     """
     from data_schema import fields, parameters, table_unit
 
@@ -149,7 +152,13 @@ def describe_model(surrogate: Surrogate, path: Path) -> dict[str, Any]:
 
 
 def describe_report(path: Path) -> dict[str, Any]:
-    """What stands in the report folder `path`: its own `report.json`. Raises ReadError where that is damaged."""
+    """What stands in the report folder `path`: its own `report.json`.
+
+    Raises
+    ------
+    ReadError
+        Where that is damaged.
+    """
     from crashkit.errors import ReadError
 
     file = path / "report.json"

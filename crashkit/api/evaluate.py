@@ -67,10 +67,10 @@ def evaluate(
 
     need("evaluating models", "train", "report")
     from crashkit.output import complete_folder, refuse_earlier
+    from crashkit.parallel import as_finished
     from evaluation.comparison.result import compare, decompose
     from evaluation.comparison.sensors import choose_sensors
     from evaluation.comparison.split import agree_on_split, entries
-    from evaluation.comparison.streaming import over_runs
     from evaluation.figures import kinds
     from evaluation.report.files import default_runs, write_run
     from evaluation.report.report import write_report
@@ -89,15 +89,17 @@ def evaluate(
         with _counted(tell, "modes of the training runs", len(split.train)) as step:
             pods = decompose(reference, split.train, done=step)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".modes-") as kept:
-            job = ScoreJob(*paths, _keep_modes(pods, Path(kept)), sensors)
-            _HELD[job.modes[0]] = (reference, stored)  # what is open here need not be opened again
+            scorer = Scorer(*paths, _keep_modes(pods, Path(kept)), sensors, opened=(reference, stored))
+            scored: dict[int, RunScores] = {}
             with _counted(tell, "test runs", len(split.test)) as step:
-                try:
-                    scored = over_runs(job, split.test, workers, scheduler, done=step)
-                finally:
-                    _HELD.clear()
+                for place, scores in as_finished(
+                    _score, split.test, scorer, workers=workers, scheduler=scheduler,
+                    label=lambda run: f"run {reference.runs[run]}",
+                ):  # fmt: skip
+                    scored[place] = scores
+                    step(split.test[place])
         result = compare(
-            reference, stored, split, seeds_as_spread=seeds_as_spread, pods=pods, scored=scored,
+            reference, stored, split, seeds_as_spread=seeds_as_spread, pods=pods, scored=[scored[k] for k in sorted(scored)],
             sensors=sensors, context=_context(Path(dataset), reference, stored, split),
         )  # fmt: skip
         if formats:
@@ -111,10 +113,6 @@ def evaluate(
         with _counted(tell, "figures", len(kinds())) as step:
             write_report(result, folder, done=lambda name: step(0))
     return result
-
-
-# Evaluation -> its dataset and models, opened once a process.
-_HELD: dict[str, tuple[Reference, tuple[Model, ...]]] = {}
 
 
 @contextlib.contextmanager
@@ -132,26 +130,32 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-@dataclass(frozen=True)
-class ScoreJob:
-    """Scoring one run, to be sent to another process: it opens the files there, once a process."""
+def _score(run: int, scorer: Scorer) -> RunScores:
+    return scorer.scores(run)
+
+
+@dataclass
+class Scorer:
+    """Scores runs. Sent to another process it leaves behind what is open, and opens the files there once."""
 
     dataset: str
     models: tuple[str, ...]
     modes: Mapping[int, str]
     sensors: Sensors
+    opened: tuple[Reference, tuple[Model, ...]] | None = None
 
-    def __call__(self, run: int) -> RunScores:
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "opened": None}
+
+    def scores(self, run: int) -> RunScores:
         import numpy as np
 
         from evaluation.comparison.result import default_groups, predictors_of
         from evaluation.comparison.scoring import score_run
 
-        evaluation = self.modes[0]  # a folder of its own, so its path names the evaluation
-        if evaluation not in _HELD:
-            _HELD.clear()
-            _HELD[evaluation] = _opened(self.dataset, self.models)
-        reference, models = _HELD[evaluation]
+        if self.opened is None:
+            self.opened = _opened(self.dataset, self.models)
+        reference, models = self.opened
         modes = {level: np.load(path, mmap_mode="r", allow_pickle=False) for level, path in self.modes.items()}
         with _one_thread():
             return score_run(reference, predictors_of(models), run, modes, default_groups(reference)[0], self.sensors)

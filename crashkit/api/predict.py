@@ -39,15 +39,26 @@ def predict(
 ) -> xr.DataArray:
     """Displacements (time, node, xyz), m, of one run.
 
-    parameters  by name, as numbers in the units of the training data or as text with a unit ("400MPa")
-    time        s; without it the states of the training runs
-    level       a mesh level of the model; without it the finest it has
-    full        on all nodes of the mesh, lifted from the level
-
     The coordinate `node` says which node of the full mesh each one is; the parameters are scalar coordinates.
     Parameters and times outside the trained range get a warning that names the range, also in the attribute `warnings`.
 
-    Raises DataError for parameters that are unknown, missing or no numbers, SurrogateError for a level it lacks.
+    Parameters
+    ----------
+    parameters
+        By name, as numbers in the units of the training data or as text with a unit ("400MPa").
+    time
+        s; without it the states of the training runs.
+    level
+        A mesh level of the model; without it the finest it has.
+    full
+        On all nodes of the mesh, lifted from the level.
+
+    Raises
+    ------
+    DataError
+        For parameters that are unknown, missing or no numbers.
+    SurrogateError
+        For a level it lacks.
     """
     import numpy as np
     import xarray as xr
@@ -130,7 +141,10 @@ def further_arrays(
     half_width  m, with `band`: that share of nodes and states lies as near to the truth, as far as validation runs tell
     displacement_by_NAME  with `sensitivity`: derivative by each parameter
 
-    Raises SurrogateError where too few validation runs were held out for a band.
+    Raises
+    ------
+    SurrogateError
+        Where too few validation runs were held out for a band.
     """
     import numpy as np
 
@@ -156,8 +170,12 @@ def write_prediction(
 ) -> list[Path]:
     """Write what `predict` gave, and `further_arrays`, to `output` by its suffix; the mesh comes from the model folder.
 
-    Raises OutputError where `output` cannot be written, DataError where the model has no mesh or a single-state file
-    was asked for several states.
+    Raises
+    ------
+    OutputError
+        Where `output` cannot be written.
+    DataError
+        Where the model has no mesh or a single-state file was asked for several states.
     """
     import numpy as np
 

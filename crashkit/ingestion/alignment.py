@@ -18,12 +18,18 @@ _END = 0.05
 def common_time(times: Sequence[NDArray[np.float64]], wanted: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
     """The times (state,) of the dataset, s: `wanted`, or those of the run with the fewest states.
 
-    times   (state,) of each run, s
-
     Solvers write the first state after a time is reached, so runs end at slightly different times: without `wanted`,
     ends within half a step of each other are brought to the earliest. Nothing is extrapolated.
 
-    Raises DataError where `wanted` is not increasing or goes beyond the `reach` of a run, or where runs have no common span.
+    Parameters
+    ----------
+    times
+        (state,) of each run, s.
+
+    Raises
+    ------
+    DataError
+        Where `wanted` is not increasing or goes beyond the `reach` of a run, or where runs have no common span.
     """
     begin, end = max(float(t[0]) for t in times), min(float(t[-1]) for t in times)
     slack = _SAME * max(abs(end), abs(begin))

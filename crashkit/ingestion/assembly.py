@@ -48,7 +48,13 @@ class Existing:
 
     @classmethod
     def open(cls, path: Path) -> Existing | None:
-        """The dataset at `path`, None if nothing is there. Raises OutputError if it is something else."""
+        """The dataset at `path`, None if nothing is there.
+
+        Raises
+        ------
+        OutputError
+            If it is something else.
+        """
         if not path.exists():
             return None
         from crashkit.dataset import open_dataset

@@ -27,6 +27,7 @@ from crashkit.ingestion.store import check_output, recover
 from crashkit.ingestion.structure import Structure
 from crashkit.ingestion.survey import Choice, Found, Survey, described, reader_options, survey
 from crashkit.ingestion.transfer import Layout, is_whole, let_memory_go, transfer
+from crashkit.parallel import as_finished
 from crashkit.version import __version__
 
 Progress = Callable[[int, int, str], None]
@@ -128,7 +129,7 @@ def ingest(
             tell=progress or (lambda done, total, note: None),
         )
         try:
-            return job.run(paths, _executor(workers, scheduler))
+            return job.run(paths, _Workers(workers, scheduler))
         finally:
             let_memory_go()
 
@@ -145,7 +146,7 @@ class _Job:
     overwrite: bool
     tell: Progress
 
-    def run(self, sources: list[Path], execute: _Executor) -> IngestSummary:
+    def run(self, sources: list[Path], workers: _Workers) -> IngestSummary:
         staging = self.staging
         staging.discard_unfinished()
         former = Existing.open(staging.output)
@@ -163,7 +164,7 @@ class _Job:
             keys = {f.name: _key(f, layout) for f in fresh}
             staged = self._staged_before(fresh, keys)
             resumed = len(staged)
-            self._transfer(fresh, keys, staged, layout, look, execute)
+            self._transfer(fresh, keys, staged, layout, look, workers)
             fresh = [f for f in fresh if f.name in staged]
             if not fresh:
                 raise DataError(f"no run can be used ({look.reasons()})")
@@ -296,85 +297,44 @@ class _Job:
         staged: dict[str, StagedRun],
         layout: Layout,
         look: Survey,
-        execute: _Executor,
+        workers: _Workers,
     ) -> None:
         """Read every run that is not staged yet and add it to `staged`; runs that are unusable are refused."""
         todo = [f for f in fresh if f.name not in staged]
-        jobs = [(found, keys[found.name], self.staging.place(keys[found.name])) for found in todo]
-        for job, outcome in execute(jobs, layout):
+        items = [(found, keys[found.name], self.staging.place(keys[found.name])) for found in todo]
+        outcomes = as_finished(
+            _attempt, items, layout,
+            workers=workers.count, scheduler=workers.scheduler, label=lambda item: f"run {item[0].name}",
+        )  # fmt: skip
+        for place, outcome in outcomes:
             if isinstance(outcome, StagedRun):
                 self.staging.finish(outcome)
                 staged[outcome.name] = outcome
             else:
-                look.refuse(todo[job].name, outcome, self.stop)
-            self.tell(len(staged), len(fresh), todo[job].name)
+                look.refuse(todo[place].name, outcome, self.stop)
+            self.tell(len(staged), len(fresh), todo[place].name)
 
 
 # --- who does the work -------------------------------------------------------------------------------------------
 
-_Jobs = Sequence[tuple[Found, str, Path]]
 _Outcome = StagedRun | CrashkitError
-_Executor = Callable[[_Jobs, Layout], Iterator[tuple[int, _Outcome]]]
 
 
-def _executor(workers: int, scheduler: str | None) -> _Executor:
-    """How jobs are done: yields (number of the job, its outcome) as they finish."""
-    if scheduler is None and workers <= 1:
-        return lambda jobs, layout: ((k, _attempt(*job, layout)) for k, job in enumerate(jobs))
-    return lambda jobs, layout: _with_dask(jobs, layout, workers, scheduler)
+@dataclass(frozen=True)
+class _Workers:
+    """How many processes on this machine, or whose scheduler."""
+
+    count: int
+    scheduler: str | None
 
 
-def _attempt(found: Found, key: str, place: Path, layout: Layout) -> _Outcome:
+def _attempt(todo: tuple[Found, str, Path], layout: Layout) -> _Outcome:
+    """Read one run; what is wrong with it is an outcome like any other."""
+    found, key, place = todo
     try:
         return transfer(found, layout, key, place)
     except (ReadError, DataError) as error:
         return error
-
-
-def _with_dask(jobs: _Jobs, layout: Layout, workers: int, scheduler: str | None) -> Iterator[tuple[int, _Outcome]]:
-    try:
-        from distributed import Client, LocalCluster, as_completed
-    except ImportError as error:
-        raise CrashkitError(
-            "--workers and --scheduler need Dask; install crashkit[distributed], or use one worker"
-        ) from error
-    import logging
-    import tempfile
-
-    if not jobs:
-        return
-    with tempfile.TemporaryDirectory(prefix="crashkit-") as folder:
-        cluster = None
-        try:
-            if scheduler is None:
-                cluster = LocalCluster(
-                    n_workers=min(workers, len(jobs)), threads_per_worker=1, dashboard_address=":0", host="127.0.0.1",
-                    local_directory=folder, memory_limit=0, silence_logs=logging.CRITICAL,
-                )  # fmt: skip
-            client = Client(cluster if cluster is not None else scheduler, timeout=30)
-        except OSError as error:
-            raise CrashkitError(
-                f"{scheduler}: no Dask scheduler answers there ({error}); start one, or check it"
-            ) from error
-        try:
-            shared = client.scatter(layout, broadcast=True)
-            futures = {
-                client.submit(_attempt, found, key, place, shared, pure=False, key=f"{found.name}-{key}"): k
-                for k, (found, key, place) in enumerate(jobs)
-            }
-            for future in as_completed(list(futures)):
-                job = futures[future]
-                try:
-                    outcome = future.result()
-                except (CrashkitError, OSError):
-                    raise
-                except Exception as error:  # Dask has several names for a worker that died
-                    raise CrashkitError(f"run {jobs[job][0].name}: its worker failed ({error})") from error
-                yield job, outcome
-        finally:
-            client.close()
-            if cluster is not None:
-                cluster.close()
 
 
 @contextmanager

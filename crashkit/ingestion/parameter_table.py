@@ -30,7 +30,13 @@ class ParameterTable:
     rows: Mapping[str, Mapping[str, tuple[float, str]]]
 
     def row(self, run: str) -> Mapping[str, tuple[float, str]]:
-        """The parameters of `run`. Raises DataError if it has no row."""
+        """The parameters of `run`.
+
+        Raises
+        ------
+        DataError
+            If it has no row.
+        """
         if run not in self.rows:
             names = list(self.rows)
             known = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
@@ -41,7 +47,12 @@ class ParameterTable:
 def read_parameter_table(path: Path) -> ParameterTable:
     """The table at `path`, told by its suffix.
 
-    Raises ReadError with the row and column of what cannot be understood, DataError naming a run with two rows.
+    Raises
+    ------
+    ReadError
+        With the row and column of what cannot be understood.
+    DataError
+        Naming a run with two rows.
     """
     header, lines = _load(path)
     columns: dict[str, tuple[str, str]] = {}

@@ -29,8 +29,12 @@ from crashkit.errors import OutputError
 class StagedRun:
     """One run whose arrays are in the staging folder.
 
-    digests  of its arrays, by name (`data_schema.checksum.array_digest`)
-    error    estimated error of the change to the common time, m
+    Attributes
+    ----------
+    digests
+        Of its arrays, by name (`data_schema.checksum.array_digest`).
+    error
+        Estimated error of the change to the common time, m.
     """
 
     key: str

@@ -25,13 +25,22 @@ _SOLIDS = {10: 4, 12: 8, 13: 6, 14: 5, 24: 10, 25: 20}
 class Structure:
     """What stays of one run's mesh.
 
-    node         (n,) int64: the nodes that stay, as numbers of the source
-    node_id      (n,) int64, position (n, 3) float64 in the source's length unit
-    face_nodes   (m, 3 or 4) int32, -1 in the last corner of a triangle among quadrilaterals
-    face_part    (m,) int32 into `parts`; face_id (m,) int64
-    face_source  (m,) int64: the shell of the source behind a face, or -1 - cell for the skin of a solid
-    cell_source  (c,) int64: the cell of the source behind each cell that stays
-    notes        what was left out, in words
+    Attributes
+    ----------
+    node
+        (n,) int64: the nodes that stay, as numbers of the source.
+    node_id
+        (n,) int64, position (n, 3) float64 in the source's length unit.
+    face_nodes
+        (m, 3 or 4) int32, -1 in the last corner of a triangle among quadrilaterals.
+    face_part
+        (m,) int32 into `parts`; face_id (m,) int64.
+    face_source
+        (m,) int64: the shell of the source behind a face, or -1 - cell for the skin of a solid.
+    cell_source
+        (c,) int64: the cell of the source behind each cell that stays.
+    notes
+        What was left out, in words.
     """
 
     node: NDArray[np.int64]
@@ -63,7 +72,10 @@ def structure_of(
 ) -> Structure:
     """The structure of `mesh`. `parts` and `exclude_parts` name parts by number, title or glob pattern.
 
-    Raises DataError if a pattern matches no part, or if nothing is left.
+    Raises
+    ------
+    DataError
+        If a pattern matches no part, or if nothing is left.
     """
     chosen, notes = _choose(mesh.parts, parts, exclude_parts, keep_rigid_walls)
     chosen = chosen[np.isin(chosen, mesh.face_part) | np.isin(chosen, mesh.cell_part)]  # empty parts say nothing
@@ -114,7 +126,10 @@ def structure_of(
 def matched(reference: Structure, other: Structure) -> Structure:
     """`other` with its nodes, faces and cells in the order of `reference`, told by their numbers.
 
-    Raises DataError if the two are not the same mesh: other node numbers, other elements, elements in other parts.
+    Raises
+    ------
+    DataError
+        If the two are not the same mesh: other node numbers, other elements, elements in other parts.
     """
     if np.array_equal(reference.node_id, other.node_id):
         order = np.arange(reference.n_nodes)

@@ -34,7 +34,10 @@ _MISSING_STEPS = 1.5
 class Choice:
     """What of each run is wanted, and how it is to be understood; the options of `ingest` that decide the content.
 
-    names   how runs are called in the dataset, from `{run}` (as its source calls it) and `{source}` (file or folder)
+    Attributes
+    ----------
+    names
+        How runs are called in the dataset, from `{run}` (as its source calls it) and `{source}` (file or folder).
     """
 
     units: str | None = None
@@ -69,11 +72,18 @@ class Field:
 class Found:
     """One run that can be used; small enough to send to a worker.
 
-    run, index  its name and place in the source; `name` is that in the dataset
-    time        (state,) s, its own output times
-    parameters  name -> (value, unit), in the dataset's units
-    as_written  name -> unit in which the table or the source gave the parameter, such as MPa; "" where none is said
-    fields      the wanted fields that it has
+    Attributes
+    ----------
+    run, index
+        Its name and place in the source; `name` is that in the dataset.
+    time
+        (state,) s, its own output times.
+    parameters
+        Name -> (value, unit), in the dataset's units.
+    as_written
+        Name -> unit in which the table or the source gave the parameter, such as MPa; "" where none is said.
+    fields
+        The wanted fields that it has.
     """
 
     source: Path
@@ -130,12 +140,21 @@ def survey(
 ) -> Survey:
     """Look at all runs in `sources`.
 
-    params     table of design parameters; its values go before those of the source
-    time       the common times asked for, if any: a run needs to reach no further
-    structure  of the dataset the runs shall join; None for a new one
-    stop       raise at the first run that cannot be used; else it is skipped, with its reason
+    Parameters
+    ----------
+    params
+        Table of design parameters; its values go before those of the source.
+    time
+        The common times asked for, if any: a run needs to reach no further.
+    structure
+        Of the dataset the runs shall join; None for a new one.
+    stop
+        Raise at the first run that cannot be used; else it is skipped, with its reason.
 
-    Raises CrashkitError for what concerns all runs (unknown format, unreadable table, a field nobody has).
+    Raises
+    ------
+    CrashkitError
+        For what concerns all runs (unknown format, unreadable table, a field nobody has).
     """
     table = read_parameter_table(params) if params is not None else None
     out = Survey(structure=structure)

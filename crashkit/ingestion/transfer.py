@@ -46,9 +46,14 @@ Block = NDArray[Any]
 class Layout:
     """What all runs of the dataset share.
 
-    structure  in metres, its order of nodes, faces and cells is the dataset's
-    time       (state,) s
-    one_shape  whether all runs have the structure's reference positions
+    Attributes
+    ----------
+    structure
+        In metres, its order of nodes, faces and cells is the dataset's.
+    time
+        (state,) s.
+    one_shape
+        Whether all runs have the structure's reference positions.
     """
 
     choice: Choice
@@ -93,7 +98,12 @@ def _reference_spec(nodes: int) -> ArraySpec:
 def transfer(found: Found, layout: Layout, key: str, place: Path) -> StagedRun:
     """Read the run `found` and write its arrays into a Zarr store at `place`, whole or not at all.
 
-    Raises CrashkitError naming file, state and node of what is wrong, OSError if the disk is full.
+    Raises
+    ------
+    CrashkitError
+        Naming file, state and node of what is wrong.
+    OSError
+        If the disk is full.
     """
     beside = place.with_name(f"{place.name}.{os.getpid()}")
     beside.parent.mkdir(exist_ok=True)

@@ -36,7 +36,10 @@ def write_levels(
 
     and, for level 1 and coarser, edges without a face as lines.
 
-    Raises OutputError if `folder` cannot be written.
+    Raises
+    ------
+    OutputError
+        If `folder` cannot be written.
     """
     folder = Path(folder)
     coarsest = np.zeros(len(position), np.int32)

@@ -36,16 +36,29 @@ def build_hierarchy(
 ) -> Hierarchy:
     """Nested coarse levels of a surface mesh with exact node counts, and the maps between them.
 
-    position       (n, 3), m
-    face_nodes     (m, 3 or 4), -1 in the last corner of a triangle among quadrilaterals
-    counts         nodes of level 1, 2, ..; decreasing. Default: n / 8, a quarter of that, a quarter of that
-    face_part      (m,) part of each face, from 0; a node is mapped from coarse nodes of its own parts only
-    selection      "quadric" (half-edge contraction) or "vtk" (vtkQuadricDecimation tied to nodes)
-    pair_distance  m; nodes of one part closer than this may contract without an edge. Default: 1 % of the diagonal
-    extra_edges    (e, 2) further graph edges between nodes of faces
-
     Nodes that no face touches stay out of the graph and take the nearest kept node.
-    Raises MeshError, saying which count or number is wrong.
+
+    Parameters
+    ----------
+    position
+        (n, 3), m.
+    face_nodes
+        (m, 3 or 4), -1 in the last corner of a triangle among quadrilaterals.
+    counts
+        Nodes of level 1, 2, ..; decreasing. Default: n / 8, a quarter of that, a quarter of that.
+    face_part
+        (m,) part of each face, from 0; a node is mapped from coarse nodes of its own parts only.
+    selection
+        "quadric" (half-edge contraction) or "vtk" (vtkQuadricDecimation tied to nodes).
+    pair_distance
+        m; nodes of one part closer than this may contract without an edge. Default: 1 % of the diagonal.
+    extra_edges
+        (e, 2) further graph edges between nodes of faces.
+
+    Raises
+    ------
+    MeshError
+        Saying which count or number is wrong.
     """
     if selection not in ("quadric", "vtk"):
         raise MeshError(f"selection {selection!r} is not known; expected quadric or vtk")

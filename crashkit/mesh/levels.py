@@ -20,14 +20,24 @@ from data_schema.edges import adjacency
 class Level:
     """One coarse level (index >= 1) of a hierarchy.
 
-    kept        (n,) int64, increasing: the level's nodes as node numbers of level 0
-    faces       (m, 3) int32 triangles in the level's own numbering
-    edges       (e, 2) int32 undirected graph edges (i < j), own numbering; includes lone edges without a face
-    in_finer    (n,) int64: position of each node among the nodes of the next finer level (D: x[in_finer])
-    to_finer    csr (n of next finer level, n): U one level up; rows sum to 1, >= 0
-    to_full     csr (n of level 0, n): U straight to level 0
-    distance    (n of level 0,) float64, m: distance of each fine node to the coarse surface
-    face_part   (m,) int32: part of each face as in the dataset; None where the mesh was given without parts
+    Attributes
+    ----------
+    kept
+        (n,) int64, increasing: the level's nodes as node numbers of level 0.
+    faces
+        (m, 3) int32 triangles in the level's own numbering.
+    edges
+        (e, 2) int32 undirected graph edges (i < j), own numbering; includes lone edges without a face.
+    in_finer
+        (n,) int64: position of each node among the nodes of the next finer level (D: x[in_finer]).
+    to_finer
+        csr (n of next finer level, n): U one level up; rows sum to 1, >= 0.
+    to_full
+        csr (n of level 0, n): U straight to level 0.
+    distance
+        (n of level 0,) float64, m: distance of each fine node to the coarse surface.
+    face_part
+        (m,) int32: part of each face as in the dataset; None where the mesh was given without parts.
     """
 
     index: int

@@ -28,18 +28,27 @@ def refine(
 ) -> Hierarchy:
     """The hierarchy with level `index` refined where `error` is large.
 
-    mesh       the surface the hierarchy was built from
-    error      (n of level 0,), m: such as the mean error of a surrogate on validation runs, lifted to level 0
-               (errors on the nodes of a level are lifted by its `to_full`)
-    tolerance  m: nodes of the next finer level with a larger error are faulty; or instead
-    nodes      how many nodes the refined level shall have: faulty nodes are added, worst first, each with its
-               neighbours, until they are that many
-
     Faulty nodes and their neighbours in the graph of the next finer level join the nodes of level `index`. The result
     stands in place of that finer level (for index 1 it becomes a new level 1), with new D, U and adjacency; the other
     levels keep their nodes.
 
-    Raises MeshError if error, tolerance or nodes make no sense, or no node is faulty.
+    Parameters
+    ----------
+    mesh
+        The surface the hierarchy was built from.
+    error
+        (n of level 0,), m: such as the mean error of a surrogate on validation runs, lifted to level 0 (errors on
+        the nodes of a level are lifted by its `to_full`).
+    tolerance
+        m: nodes of the next finer level with a larger error are faulty; or instead.
+    nodes
+        How many nodes the refined level shall have: faulty nodes are added, worst first, each with its neighbours,
+        until they are that many.
+
+    Raises
+    ------
+    MeshError
+        If error, tolerance or nodes make no sense, or no node is faulty.
     """
     coarse = hierarchy[index]
     values = np.asarray(error, np.float64)

@@ -43,11 +43,18 @@ _SAME_PLACE = 1e-6
 class Selection:
     """The nodes one level keeps and the mesh between them, all as node numbers of level 0.
 
-    kept    (k,) int64, increasing
-    faces   (m, 3) int32, part (m,) int32
-    edges   (e, 2) int32, i < j
-    parts   (k, words) uint64: bit sets of the parts of each kept node
-    into    (n of level 0,) int32: the kept node that stands for each node; -1 for nodes no face touches
+    Attributes
+    ----------
+    kept
+        (k,) int64, increasing.
+    faces
+        (m, 3) int32, part (m,) int32.
+    edges
+        (e, 2) int32, i < j.
+    parts
+        (k, words) uint64: bit sets of the parts of each kept node.
+    into
+        (n of level 0,) int32: the kept node that stands for each node; -1 for nodes no face touches.
     """
 
     kept: NDArray[np.int64]
@@ -80,7 +87,10 @@ def select_quadric(
     `pair_distance`, m: nodes of one part closer than this may contract without sharing an edge, see `_close_pairs`.
     The result does not depend on the order of nodes or faces, up to nodes at the very same place.
 
-    Raises MeshError if a count cannot be reached because every part must keep a node.
+    Raises
+    ------
+    MeshError
+        If a count cannot be reached because every part must keep a node.
     """
     base = everything(mesh)
     nodes, state = _start(mesh, base, boundary, spread)
@@ -103,7 +113,10 @@ def select_quadric(
 def contract_onto(mesh: Surface, base: Selection, keep: NDArray[np.integer]) -> Selection:
     """The mesh that is left of `base` when exactly the nodes `keep` (numbers of level 0, some of its own) stay.
 
-    Raises MeshError if a part, with those it shares nodes with, has no node in `keep`.
+    Raises
+    ------
+    MeshError
+        If a part, with those it shares nodes with, has no node in `keep`.
     """
     return _contract_base(mesh, base, np.isin(base.kept, keep), 0, 0.0)
 

@@ -27,7 +27,10 @@ _RUNS = 10
 def select_vtk(mesh: Surface, counts: list[int], pair_distance: float = 0.0) -> list[Selection]:
     """One selection for each of `counts` (decreasing), every one a subset of the one before.
 
-    Raises MeshError if a count cannot be reached because every part must keep a node.
+    Raises
+    ------
+    MeshError
+        If a count cannot be reached because every part must keep a node.
     """
     selections = []
     finer = everything(mesh)

@@ -50,7 +50,12 @@ def write_hierarchy(
     The displacements are read once, a block of states at a time; `progress(runs done, runs)` is called after each
     run. An older hierarchy is replaced when the new one is complete.
 
-    Raises DataError if the hierarchy is not one of this dataset's mesh, OutputError if `path` cannot be written.
+    Raises
+    ------
+    DataError
+        If the hierarchy is not one of this dataset's mesh.
+    OutputError
+        If `path` cannot be written.
     """
     path = Path(path)
     with open_dataset(path, chunks=None) as dataset:
@@ -82,7 +87,12 @@ def write_hierarchy(
 def read_hierarchy(path: str | Path) -> Hierarchy:
     """The hierarchy stored in the dataset at `path`.
 
-    Raises DataError if there is none or it belongs to another mesh, ReadError if it is damaged.
+    Raises
+    ------
+    DataError
+        If there is none or it belongs to another mesh.
+    ReadError
+        If it is damaged.
     """
     path = Path(path)
     about = _about(path)
@@ -184,7 +194,10 @@ class MeshArrays:
 def open_mesh(path: Path) -> MeshArrays:
     """The mesh of the dataset at `path`; where the runs differ in shape, the one of the first run.
 
-    Raises ReadError if the file is no crash dataset or lacks its faces.
+    Raises
+    ------
+    ReadError
+        If the file is no crash dataset or lacks its faces.
     """
     with open_dataset(path, chunks=None) as dataset:
         at = dataset["reference_position"]

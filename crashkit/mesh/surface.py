@@ -20,11 +20,18 @@ from data_schema.edges import face_edges, unique_pairs
 class Surface:
     """Triangles and graph edges over the nodes of level 0.
 
-    position   (n, 3) float64, m
-    triangles  (m, 3) int32: quadrilaterals cut in two, degenerate and doubled ones left out
-    part       (m,) int32: part of each triangle
-    edges      (e, 2) int32, i < j: sides of the faces as they were given (no diagonals) and extra edges
-    used       (n,) bool: nodes that a face touches; the others are kept out of the graph
+    Attributes
+    ----------
+    position
+        (n, 3) float64, m.
+    triangles
+        (m, 3) int32: quadrilaterals cut in two, degenerate and doubled ones left out.
+    part
+        (m,) int32: part of each triangle.
+    edges
+        (e, 2) int32, i < j: sides of the faces as they were given (no diagonals) and extra edges.
+    used
+        (n,) bool: nodes that a face touches; the others are kept out of the graph.
     """
 
     position: NDArray[np.float64]
@@ -64,7 +71,10 @@ def surface(
     `face_part` (m,) numbers the parts from 0; without it everything is one part. `extra_edges` (e, 2) join nodes
     that faces touch (spot welds, say): they enter the graph and nothing else.
 
-    Raises MeshError if there is no face, or if numbers point nowhere.
+    Raises
+    ------
+    MeshError
+        If there is no face, or if numbers point nowhere.
     """
     at = np.ascontiguousarray(position, dtype=np.float64)
     corners = np.asarray(face_nodes)

@@ -47,7 +47,12 @@ def readers() -> dict[str, Reader]:
 def reader_for(path: Path, name: str | None = None) -> Reader:
     """The reader called `name`, or the one that recognises the content of `path`.
 
-    Raises CrashkitError for an unknown name, ReadError where the path does not exist or nobody knows it.
+    Raises
+    ------
+    CrashkitError
+        For an unknown name.
+    ReadError
+        Where the path does not exist or nobody knows it.
     """
     known = readers()
     if name is not None:

@@ -54,11 +54,15 @@ class Grid:
 class GridSource(ABC):
     """Where the states of a run come from.
 
-    files, time, problems   as in `Run`
     first()       the mesh of the first state with all its arrays
     points()      (node, 3) of one state, after a check that the state has the first one's cells
     array()       one array of one state
     place()       file and state for messages
+
+    Attributes
+    ----------
+    files, time, problems
+        As in `Run`.
     """
 
     files: tuple[Path, ...]

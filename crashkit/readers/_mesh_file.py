@@ -20,7 +20,10 @@ def faces_of(path: Path, position: NDArray[np.floating]) -> NDArray[np.int32]:
     `position` is (node, 3), in any unit and any rigid motion: nodes must agree in number and order, which is
     checked by the ratio of edge lengths. The file is read by meshio or, for VTK's own formats, by VTK.
 
-    Raises ReadError naming the file and what differs.
+    Raises
+    ------
+    ReadError
+        Naming the file and what differs.
     """
     points, faces = _read(path)
     if len(points) != len(position):

@@ -33,7 +33,13 @@ def is_legacy(file: Path) -> bool:
 
 
 def read_legacy(file: Path) -> Grid:
-    """The mesh and arrays of one legacy file. Raises ReadError naming the byte where it stops making sense."""
+    """The mesh and arrays of one legacy file.
+
+    Raises
+    ------
+    ReadError
+        Naming the byte where it stops making sense.
+    """
     try:
         content = file.read_bytes()
     except OSError as error:

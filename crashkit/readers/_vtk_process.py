@@ -32,7 +32,10 @@ _POLYHEDRON = 42
 def read_xml(file: Path, point_arrays: Sequence[str] | None = None) -> Grid:
     """The mesh and arrays of one VTU or VTP file; of the point arrays only `point_arrays` where they are given.
 
-    Raises ReadError where VTK reports an error, dies or hangs.
+    Raises
+    ------
+    ReadError
+        Where VTK reports an error, dies or hangs.
     """
     answer, arrays = _ask(file, {"file": os.fspath(file), "point_arrays": point_arrays})
     named: dict[str, dict[str, NDArray[Any]]] = {"mesh": {}, "point": {}, "cell": {}, "field": {}}

@@ -30,13 +30,22 @@ class Mesh(Protocol):
 class Predictor(Protocol):
     """One row of every table. The command line wraps each level of a stored model into one of these.
 
-    name          "MH1", "PODNN", "POD-GPR r=12", ...
-    level         the mesh level it predicts on; 0 is the full mesh
-    mesh          its coarse mesh where that is not the dataset's level, as after adaptive refinement; else None
-    n_parameters  trained numbers, the budget shown beside the errors
-    n_latent      numbers a state is reduced to (4 in the paper); the POD floor beside it has as many modes
-    seconds_per_epoch, training_seconds  as recorded during training (NaN where it makes no sense)
-    history       epoch curves by name: "total", "approximation", "reconstruction"; empty where not iterative
+    Attributes
+    ----------
+    name
+        "MH1", "PODNN", "POD-GPR r=12", ...
+    level
+        The mesh level it predicts on; 0 is the full mesh.
+    mesh
+        Its coarse mesh where that is not the dataset's level, as after adaptive refinement; else None.
+    n_parameters
+        Trained numbers, the budget shown beside the errors.
+    n_latent
+        Numbers a state is reduced to (4 in the paper); the POD floor beside it has as many modes.
+    seconds_per_epoch, training_seconds
+        As recorded during training (NaN where it makes no sense).
+    history
+        Epoch curves by name: "total", "approximation", "reconstruction"; empty where not iterative.
     """
 
     name: str
@@ -71,14 +80,24 @@ class Banded(Protocol):
 class Model:
     """A trained model: one predictor for each level it can answer on, finest first, and what it has seen.
 
-    name            what the model is called where folders are told apart: the folder's name
-    predictors      finest level first; a cascade has several, a baseline one
-    fitted_runs     runs whose states trained it
-    tuned_runs      runs that chose anything: best epoch, number of modes, settings
-    held_out_runs   runs it was told to leave alone; what a comparison is made on
-    checksum        SHA-256 of the dataset it was trained on
-    seed            of its training; None where nothing is random
-    configuration   its settings, for the methods section; without the seed, models of one kind agree in it
+    Attributes
+    ----------
+    name
+        What the model is called where folders are told apart: the folder's name.
+    predictors
+        Finest level first; a cascade has several, a baseline one.
+    fitted_runs
+        Runs whose states trained it.
+    tuned_runs
+        Runs that chose anything: best epoch, number of modes, settings.
+    held_out_runs
+        Runs it was told to leave alone; what a comparison is made on.
+    checksum
+        SHA-256 of the dataset it was trained on.
+    seed
+        Of its training; None where nothing is random.
+    configuration
+        Its settings, for the methods section; without the seed, models of one kind agree in it.
     """
 
     name: str

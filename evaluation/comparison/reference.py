@@ -20,18 +20,28 @@ if TYPE_CHECKING:
 class Reference:
     """Everything about the runs but their fields, and a way to read these.
 
-    runs             (sim,) names
-    parameters       (sim, parameter) float64 in `parameter_units`
-    time             (state,) float64, s
-    displacement     run number -> (state, node, 3) float32, m; NaN where a node is gone
-    position         (node, 3) float64, m: undeformed; of the first run where runs differ in shape
-    faces            (face, 3 or 4) int32, -1 in the last corner of a triangle among quadrilaterals
-    face_part        (face,) int32 index into `part_names`
     node_id, part_id the solver's own numbers
     levels           coarse levels, level 1 first; may be empty
     checksum         SHA-256 that identifies the dataset
     positions        run number -> (node, 3), m, where runs differ in shape; else None
     alive            run number -> (state, face) bool, False once an element has failed; None where nothing erodes
+
+    Attributes
+    ----------
+    runs
+        (sim,) names.
+    parameters
+        (sim, parameter) float64 in `parameter_units`.
+    time
+        (state,) float64, s.
+    displacement
+        Run number -> (state, node, 3) float32, m; NaN where a node is gone.
+    position
+        (node, 3) float64, m: undeformed; of the first run where runs differ in shape.
+    faces
+        (face, 3 or 4) int32, -1 in the last corner of a triangle among quadrilaterals.
+    face_part
+        (face,) int32 index into `part_names`.
     """
 
     runs: tuple[str, ...]
@@ -65,7 +75,13 @@ class Reference:
         return self.n_nodes if level == 0 else self.level(level).n_nodes
 
     def level(self, index: int) -> Level:
-        """Coarse level `index` (1 is the finest). Raises EvaluationError where the hierarchy has no such level."""
+        """Coarse level `index` (1 is the finest).
+
+        Raises
+        ------
+        EvaluationError
+            Where the hierarchy has no such level.
+        """
         if not 1 <= index <= len(self.levels):
             raise EvaluationError(
                 f"level {index} asked for; the dataset's hierarchy has {len(self.levels)} coarse levels; "
@@ -82,7 +98,13 @@ class Reference:
         return out
 
     def index(self, names: Sequence[str]) -> tuple[int, ...]:
-        """Run numbers of `names`, in their order. Raises EvaluationError naming a run that is not there."""
+        """Run numbers of `names`, in their order.
+
+        Raises
+        ------
+        EvaluationError
+            Naming a run that is not there.
+        """
         number = {name: k for k, name in enumerate(self.runs)}
         missing = [name for name in names if name not in number]
         if missing:

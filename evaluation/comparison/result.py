@@ -16,7 +16,6 @@ from evaluation.comparison.reference import Reference
 from evaluation.comparison.scoring import Key, RunScores, Scores, full_field, gather, mesh_of, score_run
 from evaluation.comparison.sensors import Sensors, choose_sensors
 from evaluation.comparison.split import Entry, Split, entries
-from evaluation.comparison.streaming import over_runs
 from evaluation.comparison.timing import Timing, time_predictions
 from evaluation.errors import EvaluationError
 from evaluation.measures.distance import masked_mean
@@ -186,7 +185,7 @@ def compare(
         pods = decompose(reference, split.train)
     if scored is None:
         modes = {level: pod.modes for level, pod in pods.items()}
-        scored = over_runs(lambda run: score_run(reference, predictors, run, modes, groups, sensors), split.test)
+        scored = [score_run(reference, predictors, run, modes, groups, sensors) for run in split.test]
     if tuple(s.run for s in scored) != split.test:
         raise EvaluationError("the scored runs are not the test runs in their order; expected one score for each")
     timings = {row.label: time_predictions(reference, predictors[row.keys[0]], split.test[0]) for row in rows if timed}

@@ -28,19 +28,33 @@ Key = tuple[int, int]  # number of the model, number of its predictor
 class RunScore:
     """What one predictor got wrong on one run; lengths in metres, everything lifted to level 0 but `on_level`.
 
-    e2              (state,) mean node error of the prediction
-    reconstruction  (state,) the same of encoding and decoding the truth: what reduction alone costs
-    q95, largest    (state,) 95 % quantile and maximum over the nodes
-    on_level        (level 0 .., ) mean over time of the error on the nodes of each level; nodes are nested, so
-                    every model can be measured on the nodes of every level
-    on_level_reconstruction  the same for encoding and decoding
-    relative        of displacements, over all nodes and states (measures.relative_error)
-    peak            where and when it is worst
-    node_sum, node_count     (node,) sum over the states in which the node is there, and how many these are
-    groups          name of a grouping ("part", "region") -> (group,) error
-    parted          errors of rigid motion and of deformation
-    watched         what the sensors would see of the prediction; None without sensors
-    covered         share of nodes and states within the predictor's own band of `NOMINAL`; NaN where it gives none
+    Attributes
+    ----------
+    e2
+        (state,) mean node error of the prediction.
+    reconstruction
+        (state,) the same of encoding and decoding the truth: what reduction alone costs.
+    q95, largest
+        (state,) 95 % quantile and maximum over the nodes.
+    on_level
+        (level 0 .., ) mean over time of the error on the nodes of each level; nodes are nested, so every model can
+        be measured on the nodes of every level.
+    on_level_reconstruction
+        The same for encoding and decoding.
+    relative
+        Of displacements, over all nodes and states (measures.relative_error).
+    peak
+        Where and when it is worst.
+    node_sum, node_count
+        (node,) sum over the states in which the node is there, and how many these are.
+    groups
+        Name of a grouping ("part", "region") -> (group,) error.
+    parted
+        Errors of rigid motion and of deformation.
+    watched
+        What the sensors would see of the prediction; None without sensors.
+    covered
+        Share of nodes and states within the predictor's own band of `NOMINAL`; NaN where it gives none.
     """
 
     e2: NDArray[np.float64]
@@ -63,11 +77,18 @@ class RunScore:
 class RunScores:
     """Every predictor on one run, and what the run itself is.
 
-    size          (state,) mean displacement of the truth, m
-    group_size    grouping -> (group,) its mean over time
-    floor         level -> (mode, state) projection error on the nodes of the level, m
-    lifting       level >= 1 -> (state,) error of lifting the truth itself from that level: what the mesh costs
-    watched       what the sensors see of the truth
+    Attributes
+    ----------
+    size
+        (state,) mean displacement of the truth, m.
+    group_size
+        Grouping -> (group,) its mean over time.
+    floor
+        Level -> (mode, state) projection error on the nodes of the level, m.
+    lifting
+        Level >= 1 -> (state,) error of lifting the truth itself from that level: what the mesh costs.
+    watched
+        What the sensors see of the truth.
     """
 
     run: int
@@ -89,11 +110,19 @@ def score_run(
 ) -> RunScores:
     """Score every predictor on run number `run`. Memory: the run, and some of its states at a time.
 
-    modes   level -> (3 * node of the level, mode) from training runs, for the projection floor
-    groups  grouping -> node numbers of each group, such as {"part": reference.part_nodes()}
     sensors where histories are taken and intrusion is watched
 
-    Raises EvaluationError naming model and run where a prediction does not fit the data or is not finite.
+    Parameters
+    ----------
+    modes
+        Level -> (3 * node of the level, mode) from training runs, for the projection floor.
+    groups
+        Grouping -> node numbers of each group, such as {"part": reference.part_nodes()}.
+
+    Raises
+    ------
+    EvaluationError
+        Naming model and run where a prediction does not fit the data or is not finite.
     """
     truth = reference.displacement(run)
     states = (len(reference.time), reference.n_nodes, 3)
@@ -217,8 +246,12 @@ def full_field(
 ) -> NDArray[np.float32]:
     """`field` (state, node of the predictor's level, 3) on the full mesh: (state, node, 3).
 
-    `states` are expected, by default all of the reference. Raises EvaluationError where the predictor gave another
-    shape than its level has.
+    `states` are expected, by default all of the reference.
+
+    Raises
+    ------
+    EvaluationError
+        Where the predictor gave another shape than its level has.
     """
     mesh = mesh_of(reference, predictor)
     nodes = reference.n_nodes if mesh is None else len(mesh.kept)
@@ -242,14 +275,24 @@ def mesh_of(reference: Reference, predictor: Predictor) -> Mesh | None:
 class Scores:
     """One row of the comparison over all seeds and test runs; lengths in metres, as in RunScore.
 
-    e2, reconstruction, q95, largest    (seed, run, state)
-    on_level, on_level_reconstruction   (seed, run, level)
-    relative, covered, peak_value, peak_state, peak_node  (seed, run)
-    node_mean                           (node,) over seeds, runs and states
-    groups                              grouping -> (seed, run, group)
-    rigid, deformation                  (seed, run, state); true_rigid, true_deformation (run, state) their sizes
-    probes                              (seed, run, state, probe, 3) displacements; empty without sensors
-    intrusion                           (seed, run, state)
+    Attributes
+    ----------
+    e2, reconstruction, q95, largest
+        (seed, run, state).
+    on_level, on_level_reconstruction
+        (seed, run, level).
+    relative, covered, peak_value, peak_state, peak_node
+        (seed, run).
+    node_mean
+        (node,) over seeds, runs and states.
+    groups
+        Grouping -> (seed, run, group).
+    rigid, deformation
+        (seed, run, state); true_rigid, true_deformation (run, state) their sizes.
+    probes
+        (seed, run, state, probe, 3) displacements; empty without sensors.
+    intrusion
+        (seed, run, state).
     """
 
     e2: NDArray[np.float64]
@@ -334,7 +377,10 @@ def gather(runs: Iterable[RunScores], keys: Sequence[Key]) -> Scores:
 def contributions(lifted: Mapping[str, NDArray[np.floating]]) -> dict[str, NDArray[np.floating]]:
     """What each level adds to the coarser one (paper, section 4.2): fields on the full mesh, coarsest first.
 
-    lifted  predictor -> field of any one shape, coarsest level first. The sum of all is the finest prediction.
+    Parameters
+    ----------
+    lifted
+        Predictor -> field of any one shape, coarsest level first. The sum of all is the finest prediction.
     """
     out: dict[str, NDArray[np.floating]] = {}
     before: NDArray[np.floating] | None = None

@@ -36,8 +36,12 @@ class Sensors:
 class Watched:
     """What the sensors saw of one field; NaN where nodes are gone.
 
-    probes     (state, probe, 3) m, displacement
-    intrusion  (state,) m, of the node furthest in
+    Attributes
+    ----------
+    probes
+        (state, probe, 3) m, displacement.
+    intrusion
+        (state,) m, of the node furthest in.
     """
 
     probes: NDArray[np.float64]
@@ -62,13 +66,20 @@ def choose_sensors(
 ) -> Sensors:
     """Sensors on the structure.
 
-    probes     the solver's node numbers; by default four nodes: the one nearest to the middle, then always the one
-               furthest from those chosen
-    intrusion  name of a part and a direction (x, -x, y, -y, z, -z), seen from the nodes of all other parts; by
-               default any node of the structure, against the direction in which the structure moves in the first run,
-               seen from the structure's own rigid motion
+    Parameters
+    ----------
+    probes
+        The solver's node numbers; by default four nodes: the one nearest to the middle, then always the one
+        furthest from those chosen.
+    intrusion
+        Name of a part and a direction (x, -x, y, -y, z, -z), seen from the nodes of all other parts; by default any
+        node of the structure, against the direction in which the structure moves in the first run, seen from the
+        structure's own rigid motion.
 
-    Raises EvaluationError for node numbers and parts that do not exist.
+    Raises
+    ------
+    EvaluationError
+        For node numbers and parts that do not exist.
     """
     chosen = _spread(reference.position) if probes is None else _numbers(reference, probes)
     everything = np.arange(reference.n_nodes)

@@ -22,9 +22,14 @@ from evaluation.errors import EvaluationError
 class Entry:
     """One row of the comparison: the same predictor of one model, or of its several seeds.
 
-    label   as in tables, figures and files
-    level   the mesh level it predicts on
-    keys    (model, predictor) numbers of its seeds, at least one
+    Attributes
+    ----------
+    label
+        As in tables, figures and files.
+    level
+        The mesh level it predicts on.
+    keys
+        (model, predictor) numbers of its seeds, at least one.
     """
 
     label: str
@@ -43,8 +48,11 @@ class Split:
 def agree_on_split(reference: Reference, models: Sequence[Model], test: Sequence[str] | None = None) -> Split:
     """The test runs: those asked for, else those that all models hold out.
 
-    Raises EvaluationError where a model was fitted or tuned on a test run, where the models hold out different
-    runs and none were asked for, where a model was trained on another dataset, and where no test run is left.
+    Raises
+    ------
+    EvaluationError
+        Where a model was fitted or tuned on a test run, where the models hold out different runs and none were
+        asked for, where a model was trained on another dataset, and where no test run is left.
     """
     for model in models:
         if model.checksum and reference.checksum and model.checksum != reference.checksum:
@@ -100,9 +108,13 @@ def _without_seed(name: str) -> str:
 def entries(models: Sequence[Model], seeds_as_spread: bool = True) -> tuple[Entry, ...]:
     """The rows of the comparison, in the order the models were given.
 
-    Models of equal configuration that differ in nothing but the seed become one row with a spread; otherwise
-    equal names are told apart by the model's own name, without the seed where there are several. Raises
-    EvaluationError for no model, for a predictor on two rows of the same label and for one model given twice.
+    Models of equal configuration that differ in nothing but the seed become one row with a spread; otherwise equal
+    names are told apart by the model's own name, without the seed where there are several.
+
+    Raises
+    ------
+    EvaluationError
+        For no model, for a predictor on two rows of the same label and for one model given twice.
     """
     if not models:
         raise EvaluationError("no model to evaluate; give at least one model folder")

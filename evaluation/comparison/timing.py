@@ -16,8 +16,12 @@ from evaluation.measures.distance import lift
 class Timing:
     """Milliseconds a state, the fastest of several repetitions on this machine.
 
-    own, lifted                on the predictor's own level and on the full mesh, all states of a run in one call
-    single, single_lifted      the same for one state alone, as an interactive viewer asks
+    Attributes
+    ----------
+    own, lifted
+        On the predictor's own level and on the full mesh, all states of a run in one call.
+    single, single_lifted
+        The same for one state alone, as an interactive viewer asks.
     """
 
     own: float

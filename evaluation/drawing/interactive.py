@@ -47,16 +47,27 @@ def interactive_view(
 ) -> str:
     """A whole HTML page that shows one run; also written to `path` unless that is None.
 
-    points      (n, 3) reference position, m
-    faces       (m, 3 or 4), -1 in the last corner of a triangle
-    time        (t,) s
-    truth, prediction  (t, n, 3) displacements, m; NaN where nodes are gone
-    alive       (t, m) bool, False once an element has eroded
-
     The size is bounded: a mesh of more than `max_nodes` nodes is shown on that many of them, chosen as the mesh
-    hierarchy chooses them, and of more than `max_states` states as many, evenly spread, with first and last.
-    Positions are rounded to 1/65535 of the space the run takes. Errors named in the page are those of all nodes.
-    Raises EvaluationError where arrays do not belong together, the extra is missing or nothing can be drawn.
+    hierarchy chooses them, and of more than `max_states` states as many, evenly spread, with first and last. Positions
+    are rounded to 1/65535 of the space the run takes. Errors named in the page are those of all nodes.
+
+    Parameters
+    ----------
+    points
+        (n, 3) reference position, m.
+    faces
+        (m, 3 or 4), -1 in the last corner of a triangle.
+    time
+        (t,) s.
+    truth, prediction
+        (t, n, 3) displacements, m; NaN where nodes are gone.
+    alive
+        (t, m) bool, False once an element has eroded.
+
+    Raises
+    ------
+    EvaluationError
+        Where arrays do not belong together, the extra is missing or nothing can be drawn.
     """
     x, corners, times = np.asarray(points, np.float64), np.asarray(faces), np.asarray(time, np.float64)
     u, p = np.asarray(truth), np.asarray(prediction)

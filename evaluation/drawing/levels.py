@@ -17,7 +17,11 @@ def draw_levels(
     """A PNG with the full mesh and every level side by side: above the kept nodes on the full mesh, below their mesh.
 
     position (n, 3), m, and face_nodes (m, 3 or 4) of level 0; lifting_error of each level, m.
-    Raises OutputError if `picture` cannot be written.
+
+    Raises
+    ------
+    OutputError
+        If `picture` cannot be written.
     """
     import numpy as np
     from matplotlib.figure import Figure

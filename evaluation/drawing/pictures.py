@@ -87,8 +87,12 @@ def field_picture(
 ) -> Figure:
     """A field on the deformed mesh.
 
-    points        (n, 3) m; displacement (n, 3) m
-    values        (n,) or (m,) in the unit that `label` names; by default between 0, or the smallest, and the largest
+    Parameters
+    ----------
+    points
+        (n, 3) m; displacement (n, 3) m.
+    values
+        (n,) or (m,) in the unit that `label` names; by default between 0, or the smallest, and the largest.
     """
     sheet = sheet or Sheet()
     position = np.asarray(points) + np.asarray(displacement)
@@ -148,7 +152,10 @@ def file_picture(
 ) -> Figure:
     """The comparison of one state of a ParaView file (`.pvd` or `.vtkhdf`), read back through VTK.
 
-    truth, prediction  names of the point arrays (n, 3), m, in the file; its points are undeformed
+    Parameters
+    ----------
+    truth, prediction
+        Names of the point arrays (n, 3), m, in the file; its points are undeformed.
     """
     from crashkit.writers.paraview import read_state
 

@@ -31,9 +31,14 @@ _SAMPLES = 2  # images are drawn this much larger and averaged: smooth edges on 
 class View:
     """A parallel projection.
 
-    right, up      (3,) unit vectors of the picture's axes
-    centre         (3,) m
-    width, height  m, of what is seen
+    Attributes
+    ----------
+    right, up
+        (3,) unit vectors of the picture's axes.
+    centre
+        (3,) m.
+    width, height
+        m, of what is seen.
     """
 
     right: NDArray[np.float64]
@@ -48,12 +53,20 @@ def choose_view(
 ) -> View:
     """The view in which all `positions` fit, chosen from the first state of the first of them.
 
-    positions  arrays (n, 3) or (t, n, 3) on one mesh, m; NaN where nodes are gone
-    faces      (m, 3 or 4)
-
     Up is z, or the axis along which the structure is clearly flatter. Of the four corners, seen from `elevation`
-    degrees above, that one which shows most of the faces' area. `margin` is left free around, as a share of the
-    size. Raises EvaluationError where no node is left to look at.
+    degrees above, that one which shows most of the faces' area. `margin` is left free around, as a share of the size.
+
+    Parameters
+    ----------
+    positions
+        Arrays (n, 3) or (t, n, 3) on one mesh, m; NaN where nodes are gone.
+    faces
+        (m, 3 or 4).
+
+    Raises
+    ------
+    EvaluationError
+        Where no node is left to look at.
     """
     clouds = [np.asarray(p, np.float64) for p in positions]
     cloud = np.concatenate([c.reshape(-1, 3) for c in clouds])
@@ -122,18 +135,32 @@ def render(
 ) -> Image:
     """One image of a deformed mesh on white.
 
-    position  (n, 3) deformed positions, m; faces with a NaN corner are left out
-    faces     (m, 3 or 4), -1 in the last corner of a triangle
-    values    (n,) or (m,) coloured between `limits` by the matplotlib colour map `colours`; NaN is grey, and
-              without values everything is
-    width     pixels; the height follows from `view`
-    alive     (m,) bool: False hides a face
-    lines     (e, 2) edges without a face, drawn as lines
-    edges     draw the edges of the faces
-    marked    numbers of nodes drawn as dots, `marker_size` pixels wide
-    ghost     (n, 3) other positions of the same mesh, drawn as a grey shadow to compare with, m
+    Parameters
+    ----------
+    position
+        (n, 3) deformed positions, m; faces with a NaN corner are left out.
+    faces
+        (m, 3 or 4), -1 in the last corner of a triangle.
+    values
+        (n,) or (m,) coloured between `limits` by the matplotlib colour map `colours`; NaN is grey, and without
+        values everything is.
+    width
+        Pixels; the height follows from `view`.
+    alive
+        (m,) bool: False hides a face.
+    lines
+        (e, 2) edges without a face, drawn as lines.
+    edges
+        Draw the edges of the faces.
+    marked
+        Numbers of nodes drawn as dots, `marker_size` pixels wide.
+    ghost
+        (n, 3) other positions of the same mesh, drawn as a grey shadow to compare with, m.
 
-    Raises EvaluationError where nothing can be drawn on this machine (see `rendering_problem`).
+    Raises
+    ------
+    EvaluationError
+        Where nothing can be drawn on this machine (see `rendering_problem`).
     """
     import pyvista as pv
 

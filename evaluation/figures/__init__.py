@@ -56,7 +56,10 @@ _FURTHER: dict[str, Kind] = {}
 def register(kind: Kind) -> None:
     """Show `kind` in every report after the figures of `ORDER`; a later one replaces an earlier one of the same name.
 
-    Raises EvaluationError where a figure of `ORDER` has this name.
+    Raises
+    ------
+    EvaluationError
+        Where a figure of `ORDER` has this name.
     """
     if kind.name in ORDER:
         raise EvaluationError(f"the report has a figure {kind.name!r} already; give yours another name")

@@ -36,7 +36,13 @@ class Curve:
     cfc: int | None
 
     def of(self, quantity: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Times (k,) and values (k, probe) of `quantity`. Raises EvaluationError where there are none."""
+        """Times (k,) and values (k, probe) of `quantity`.
+
+        Raises
+        ------
+        EvaluationError
+            Where there are none.
+        """
         values = getattr(self, quantity)
         if values is None:
             raise EvaluationError(f"no {quantity}: the states are too far apart, or too uneven, for a filter")
@@ -148,7 +154,10 @@ def grade(rating: float) -> str:
 def rating_table(found: Ratings, nodes: Sequence[int]) -> dict[str, list[object]]:
     """Model, quantity, probe -> mean and lowest rating over the runs, and the grade of the mean.
 
-    nodes  the solver's number of each probe
+    Parameters
+    ----------
+    nodes
+        The solver's number of each probe.
     """
     table: dict[str, list[object]] = {
         name: [] for name in ("model", "quantity", "probe_node", "mean_rating", "lowest_rating", "grade")

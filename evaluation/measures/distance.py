@@ -21,7 +21,10 @@ from evaluation.errors import EvaluationError
 def node_distance(truth: NDArray[np.floating], prediction: NDArray[np.floating]) -> NDArray[np.float64]:
     """|q - q~|_2 of every node in every state: (state, node), m; NaN where the node is gone in `truth`.
 
-    Raises EvaluationError where the shapes differ or the prediction is not finite at a node that is there.
+    Raises
+    ------
+    EvaluationError
+        Where the shapes differ or the prediction is not finite at a node that is there.
     """
     if truth.shape != prediction.shape or truth.ndim != 3 or truth.shape[-1] != 3:
         raise EvaluationError(
@@ -100,7 +103,13 @@ class Peak:
 
 
 def peak_error(distance: NDArray[np.float64]) -> Peak:
-    """Where and when `distance` (state, node) is largest. Raises EvaluationError where every node is gone."""
+    """Where and when `distance` (state, node) is largest.
+
+    Raises
+    ------
+    EvaluationError
+        Where every node is gone.
+    """
     if np.isnan(distance).all():
         raise EvaluationError("every node is gone in every state; expected at least one living node to measure")
     state, node = np.unravel_index(int(np.nanargmax(distance)), distance.shape)

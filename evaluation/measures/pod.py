@@ -80,7 +80,13 @@ class StreamedPod:
         self._factor = factor
 
     def result(self) -> Pod:
-        """The decomposition of everything added. Raises EvaluationError where nothing moved or nothing came."""
+        """The decomposition of everything added.
+
+        Raises
+        ------
+        EvaluationError
+            Where nothing moved or nothing came.
+        """
         if self._factor is None:
             raise EvaluationError("no run was given to the decomposition; expected at least one training run")
         values = np.sqrt(np.square(self._factor, dtype=np.float64).sum(axis=0))[: self.count]

@@ -88,12 +88,20 @@ def possible_classes(time: ArrayLike) -> tuple[int, ...]:
 def cfc_filter(time: ArrayLike, values: ArrayLike, cfc: int) -> Floats:
     """`values` (t, ...) through the phaseless filter of class `cfc`: 60, 180, 600 or 1000.
 
-    time  (t,) s, even. A history that ends in NaN (a node that is gone) is filtered up to there.
+    The curve is continued at both ends by its own reflection in the end point, so that a filter that starts has no step
+    to ring from. States are written without a filter against aliases, unlike a sensor's samples, so what vibrates
+    faster than half their rate is in them all the same.
 
-    The curve is continued at both ends by its own reflection in the end point, so that a filter that starts has no
-    step to ring from. Raises EvaluationError for another class, uneven times, gaps, and times too coarse for the
-    class: J211-1 asks for ten samples a second for each hertz of the class. States are written without a filter
-    against aliases, unlike a sensor's samples, so what vibrates faster than half their rate is in them all the same.
+    Parameters
+    ----------
+    time
+        (t,) s, even. A history that ends in NaN (a node that is gone) is filtered up to there.
+
+    Raises
+    ------
+    EvaluationError
+        For another class, uneven times, gaps, and times too coarse for the class: J211-1 asks for ten samples a
+        second for each hertz of the class.
     """
     from scipy.signal import filtfilt
 
@@ -149,14 +157,24 @@ def intrusion(
 ) -> Intrusion:
     """How far `nodes` of a part come in along `direction`, as seen from the `reference` nodes.
 
-    position      (n, 3) undeformed, m
-    displacement  (t, n, 3), m; NaN once a node is gone
-    nodes         numbers of the nodes that intrude
-    direction     (3,) of any length but zero, in the undeformed structure: (-1, 0, 0) is rearwards where x is forwards
-    reference     numbers of at least three nodes off one line, such as the seat's cross member: the observer moves and
-                  turns with them (best fit, evaluation.measures.rigid). Without: measured from the ground.
+    Parameters
+    ----------
+    position
+        (n, 3) undeformed, m.
+    displacement
+        (t, n, 3), m; NaN once a node is gone.
+    nodes
+        Numbers of the nodes that intrude.
+    direction
+        (3,) of any length but zero, in the undeformed structure: (-1, 0, 0) is rearwards where x is forwards.
+    reference
+        Numbers of at least three nodes off one line, such as the seat's cross member: the observer moves and turns
+        with them (best fit, evaluation.measures.rigid). Without: measured from the ground.
 
-    Raises EvaluationError for nodes that do not exist, a direction of zero, or where all nodes are gone throughout.
+    Raises
+    ------
+    EvaluationError
+        For nodes that do not exist, a direction of zero, or where all nodes are gone throughout.
     """
     x, u = np.asarray(position, np.float64), np.asarray(displacement)
     inside = np.atleast_1d(np.asarray(nodes, np.int64))
@@ -210,8 +228,12 @@ def rate(time: ArrayLike, truth: ArrayLike, prediction: ArrayLike) -> Rating:
     """ISO/TS 18571 rating of a predicted against a true curve (t,), any unit, at `time` (t,), s.
 
     Both are brought to the 10 kHz that the standard asks for by cubic splines; filter noisy curves before
-    (`cfc_filter`). Curves end together where either ends in NaN. Raises EvaluationError for a true curve that never
-    changes, which the standard cannot rate, and for less than 2 ms.
+    (`cfc_filter`). Curves end together where either ends in NaN.
+
+    Raises
+    ------
+    EvaluationError
+        For a true curve that never changes, which the standard cannot rate, and for less than 2 ms.
     """
     from scipy.interpolate import make_interp_spline
 

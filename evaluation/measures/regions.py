@@ -76,7 +76,10 @@ def _boxes(x: NDArray[np.float64], counts: Sequence[int]) -> list[tuple[tuple[in
 def named(sets: Mapping[str, ArrayLike], n_nodes: int) -> NodeGroups:
     """NodeGroups from node numbers by name; empty ones are left out.
 
-    Raises EvaluationError for numbers that are no nodes of a mesh with `n_nodes` nodes.
+    Raises
+    ------
+    EvaluationError
+        For numbers that are no nodes of a mesh with `n_nodes` nodes.
     """
     names, nodes = [], []
     for name, numbers in sets.items():
@@ -96,10 +99,16 @@ def named(sets: Mapping[str, ArrayLike], n_nodes: int) -> NodeGroups:
 class GroupError:
     """The error of one run in one group of nodes; lengths in m, NaN where every node is gone throughout.
 
-    mean            over time of the mean over the group's nodes, as in the paper's measure
-    last            mean over the nodes in the last state
-    largest         the largest node error, in `state` at `node`
-    size            mean over time of the mean true displacement, if that was given: what to hold the mean against
+    Attributes
+    ----------
+    mean
+        Over time of the mean over the group's nodes, as in the paper's measure.
+    last
+        Mean over the nodes in the last state.
+    largest
+        The largest node error, in `state` at `node`.
+    size
+        Mean over time of the mean true displacement, if that was given: what to hold the mean against.
     """
 
     name: str
@@ -152,7 +161,10 @@ class Worst:
 def worst_of(distances: Iterable[NDArray[np.floating]]) -> Worst:
     """Worst run, state and node of node errors (t, n), m, one array a run; only one is looked at a time.
 
-    Raises EvaluationError where there is no run, or no node left in any.
+    Raises
+    ------
+    EvaluationError
+        Where there is no run, or no node left in any.
     """
     worst = None
     for run, distance in enumerate(distances):

@@ -27,9 +27,14 @@ Floats = NDArray[np.float64]
 class RigidMotion:
     """The best-fitting rigid motion of each state; NaN where fewer than three nodes are left.
 
-    rotation     (t, 3, 3) proper rotations R
-    translation  (t, 3) T, m: how far the centroid of the undeformed nodes is carried
-    centre       (3,) c, m
+    Attributes
+    ----------
+    rotation
+        (t, 3, 3) proper rotations R.
+    translation
+        (t, 3) T, m: how far the centroid of the undeformed nodes is carried.
+    centre
+        (3,) c, m.
     """
 
     rotation: Floats
@@ -56,7 +61,11 @@ def fit_rigid(position: ArrayLike, displacement: ArrayLike, nodes: ArrayLike | N
     """The rigid motion of `displacement` (t, n, 3), m, of nodes at `position` (n, 3), m.
 
     `nodes` are the numbers of those nodes that count (a seat, a cross member); all of them by default.
-    Raises EvaluationError for arrays that do not fit or fewer than three nodes.
+
+    Raises
+    ------
+    EvaluationError
+        For arrays that do not fit or fewer than three nodes.
     """
     x, u = _checked(position, displacement)
     if nodes is not None:
@@ -88,12 +97,20 @@ def _rotation(before: Floats, after: Floats) -> Floats:
 class SplitError:
     """Errors of a prediction by kind, one value a state (t,); all but `rotation` in m.
 
-    translation       distance between the predicted and the true translation of the body
-    rotation          angle between the predicted and the true rotation, degrees
-    rigid             mean over nodes of the distance between predicted and true rigid displacement
-    deformation       mean over nodes of the distance between predicted and true deformation: the crush alone
-    total             mean node error; not the sum of the two, since they may point in opposite directions
-    true_rigid, true_deformation   mean sizes of what is predicted
+    Attributes
+    ----------
+    translation
+        Distance between the predicted and the true translation of the body.
+    rotation
+        Angle between the predicted and the true rotation, degrees.
+    rigid
+        Mean over nodes of the distance between predicted and true rigid displacement.
+    deformation
+        Mean over nodes of the distance between predicted and true deformation: the crush alone.
+    total
+        Mean node error; not the sum of the two, since they may point in opposite directions.
+    true_rigid, true_deformation
+        Mean sizes of what is predicted.
     """
 
     translation: Floats
@@ -110,11 +127,19 @@ def split_error(
 ) -> SplitError:
     """Errors of `prediction` against `truth` (t, n, 3), m, in rigid motion and in deformation.
 
-    position  (n, 3) undeformed, m
-    nodes     the nodes whose motion is the body's; all by default
+    Nodes that are gone in `truth` (NaN) are left out on both sides.
 
-    Nodes that are gone in `truth` (NaN) are left out on both sides. Raises EvaluationError where arrays do not fit
-    or the prediction is not finite at a node that is there.
+    Parameters
+    ----------
+    position
+        (n, 3) undeformed, m.
+    nodes
+        The nodes whose motion is the body's; all by default.
+
+    Raises
+    ------
+    EvaluationError
+        Where arrays do not fit or the prediction is not finite at a node that is there.
     """
     x, u = _checked(position, truth)
     _, p = _checked(position, prediction)

@@ -34,9 +34,13 @@ def state_blocks(states: int, nodes: int) -> Iterator[slice]:
 
 @dataclass
 class Tally:
-    """Feed blocks of states with `add`; every number is that of the whole run (see evaluation.comparison.scoring.RunScore).
+    """Feed blocks of states with `add`; every number is that of the whole run (see
+    evaluation.comparison.scoring.RunScore).
 
-    groups  grouping -> node numbers of each group
+    Attributes
+    ----------
+    groups
+        Grouping -> node numbers of each group.
     """
 
     groups: Groups

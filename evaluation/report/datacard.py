@@ -41,11 +41,18 @@ OUTLIER_LIMIT = 5.0  # robust standard deviations
 class Summary:
     """One pass over the runs of a dataset.
 
-    mean, largest  (run, state) m, displacement over the living nodes
-    speed          (run,) m/s, the fastest any node moves between two states
-    lost           (run,) share of nodes gone in the last state
-    samples        (run, state, sample node, 3) m, NaN where gone
-    pod            of all runs
+    Attributes
+    ----------
+    mean, largest
+        (run, state) m, displacement over the living nodes.
+    speed
+        (run,) m/s, the fastest any node moves between two states.
+    lost
+        (run,) share of nodes gone in the last state.
+    samples
+        (run, state, sample node, 3) m, NaN where gone.
+    pod
+        Of all runs.
     """
 
     mean: NDArray[np.float64]
@@ -214,11 +221,21 @@ def write_card(
 ) -> Path:
     """Write the data card of `dataset` into the folder `output` and return the page, `card.html`.
 
-    about  further lines for the methods section, such as the path and size of the dataset
-    done   called with the run number as each run is read
-
     Figures (PNG, SVG, CSV) and card.json stand beside the page. The folder appears when it is complete.
-    Raises EvaluationError for a dataset without motion, OutputError where `output` cannot be written.
+
+    Parameters
+    ----------
+    about
+        Further lines for the methods section, such as the path and size of the dataset.
+    done
+        Called with the run number as each run is read.
+
+    Raises
+    ------
+    EvaluationError
+        For a dataset without motion.
+    OutputError
+        Where `output` cannot be written.
     """
     reference = dataset if isinstance(dataset, Reference) else reference_of(dataset)
     if not reference.runs:

@@ -129,9 +129,13 @@ def show_table(
 ) -> ShownTable:
     """Columns as a table of the page.
 
-    headings  column -> what stands above it; only these columns are shown, in this order (default: all, in the
-              units that people read)
-    lowest    columns in which the smallest number is marked as the best
+    Parameters
+    ----------
+    headings
+        Column -> what stands above it; only these columns are shown, in this order (default: all, in the units that
+        people read).
+    lowest
+        Columns in which the smallest number is marked as the best.
     """
     if headings is None:
         columns = dict(_readable_column(name, values) for name, values in columns.items())

@@ -75,9 +75,14 @@ def write_report(
 ) -> Path:
     """Write report.html, report.json, figures/ (PNG, SVG, CSV) and tables/ (CSV) into `folder`; returns the page.
 
-    names  the figures, in their order; default: all (figures.kinds)
-    view   whether to make an interactive view of the worst run, where the viewer extra is there
-    done   called with the name of each figure when it is written
+    Parameters
+    ----------
+    names
+        The figures, in their order; default: all (figures.kinds).
+    view
+        Whether to make an interactive view of the worst run, where the viewer extra is there.
+    done
+        Called with the name of each figure when it is written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     sheet = sheet_of(evaluation)

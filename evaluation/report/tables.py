@@ -19,13 +19,18 @@ class Performance:
 
     error               e2: mean over nodes, time, test runs and seeds
     spread              standard deviation of that over seeds; NaN for one seed
-    relative            relative L2 error of displacements, mean over runs
-    worst_run           its error and its name
     peak                largest error of any node at any time
     reduction           error of encoding and decoding the truth
     pod_floor           projection on as many modes as the model has latent numbers
     lifting             cost of the static upsampling alone
     covered             share of nodes and states of the test runs within the model's own 90 % band; NaN without one
+
+    Attributes
+    ----------
+    relative
+        Relative L2 error of displacements, mean over runs.
+    worst_run
+        Its error and its name.
     """
 
     model: str

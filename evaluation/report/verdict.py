@@ -62,8 +62,11 @@ def statements(evaluation: Evaluation) -> list[Statement]:
 def difference(a: NDArray[np.float64], b: NDArray[np.float64], resamples: int = 4000) -> tuple[float, float, float]:
     """Mean of `a - b` and its 95 % interval by a bootstrap over runs, the same for both, and over the seeds of each.
 
-    a, b  (seed, run) m, or (run,) of one seed. Seeded. One run: the interval is infinite, since one run says nothing
-          about the next. See Efron and Tibshirani, An Introduction to the Bootstrap (1993), chapter 13.
+    Parameters
+    ----------
+    a, b
+        (seed, run) m, or (run,) of one seed. Seeded. One run: the interval is infinite, since one run says nothing
+        about the next. See Efron and Tibshirani, An Introduction to the Bootstrap (1993), chapter 13.
     """
     rng = np.random.default_rng(0)
     errors = [np.atleast_2d(np.asarray(x, dtype=np.float64)) for x in (a, b)]

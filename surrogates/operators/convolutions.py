@@ -122,10 +122,15 @@ class ChebConv(nn.Module):
     """y = sum_k T_k(L) x W_k + b, then ELU if asked: (node, batch, in) -> (node, batch, out).
 
     order     number of Chebyshev terms; 3 means T_0, T_1, T_2 (Defferrard et al. 2016, equation 4)
-    operator  a GraphOperator of kind "cheb"
-    elu       apply ELU to the result, in place
 
     Parameters: weight (order, in, out), Glorot-uniform for each term; bias (out), zero.
+
+    Attributes
+    ----------
+    operator
+        A GraphOperator of kind "cheb".
+    elu
+        Apply ELU to the result, in place.
     """
 
     def __init__(

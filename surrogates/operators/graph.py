@@ -34,10 +34,15 @@ class GraphOperator:
     kind "gcn" or "gcn2"  (D + I)^-1/2 (A + I) (D + I)^-1/2
 
     edges    (e, 2) int, undirected; both directions, repeated edges and loops are allowed and count once (loops not)
-    n_nodes  number of nodes; a node without an edge has D^-1/2 = 0, so its row of L is that of I
-    form     "sparse", "dense", or "auto": dense up to `DENSE_UP_TO` nodes of the device in use
 
     Raises SurrogateError where an edge names a node that is not there, or the graph has no node.
+
+    Attributes
+    ----------
+    n_nodes
+        Number of nodes; a node without an edge has D^-1/2 = 0, so its row of L is that of I.
+    form
+        "sparse", "dense", or "auto": dense up to `DENSE_UP_TO` nodes of the device in use.
     """
 
     def __init__(self, edges: ArrayLike, n_nodes: int, kind: Kind = "cheb", form: Form = "auto") -> None:

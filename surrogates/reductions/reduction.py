@@ -45,7 +45,10 @@ class Reduction(nn.Module):
 class LinearStart:
     """Where a linear reduction starts: z = encode^T x, x = decode z + offset.
 
-    encode  (3 * node, latent), decode (3 * node, latent), offset (3 * node,)
+    Attributes
+    ----------
+    encode
+        (3 * node, latent), decode (3 * node, latent), offset (3 * node,).
     """
 
     encode: Tensor
@@ -189,8 +192,11 @@ _MAKERS: dict[str, Maker] = {"gcn": _graph, "ae": _dense, "pod": _pod}
 def register(name: str, make: Maker) -> None:
     """Let settings say `level.reduction=name`. Models stored with it load where it is registered, too.
 
-    make  (settings, edges, n_nodes, decoded) -> Reduction; `decoded` is longer than `settings.latent` where the latent
-          vectors of several levels stand side by side
+    Parameters
+    ----------
+    make
+        (settings, edges, n_nodes, decoded) -> Reduction; `decoded` is longer than `settings.latent` where the
+        latent vectors of several levels stand side by side.
     """
     if name not in REDUCTIONS:
         REDUCTIONS.append(name)
@@ -204,7 +210,10 @@ def make_reduction(
 
     `decoded` is the length of the latent vector that the decoder reads; default: the encoder's.
 
-    Raises SurrogateError for a latent vector longer than the state.
+    Raises
+    ------
+    SurrogateError
+        For a latent vector longer than the state.
     """
     latent, decoded = settings.latent, decoded or settings.latent
     if latent > 3 * n_nodes:

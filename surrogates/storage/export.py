@@ -48,7 +48,10 @@ def export(surrogate: Surrogate, path: str | Path, level: int | None = None, *, 
     Returns the largest difference on the corners and the middle of the trained range, relative to the largest
     displacement. The file only stands under its name if that is at most `TOLERANCE`.
 
-    Raises SurrogateError for POD regressions, other suffixes, missing packages, and a file that disagrees.
+    Raises
+    ------
+    SurrogateError
+        For POD regressions, other suffixes, missing packages, and a file that disagrees.
     """
     path = Path(path)
     if path.suffix not in SUFFIXES:

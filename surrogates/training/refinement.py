@@ -21,8 +21,12 @@ from surrogates.errors import SurrogateError
 class Refined:
     """Graphs whose levels finer than `number` are still those of the hierarchy.
 
-    places     (node of level `number`,) where its nodes stand among those of the hierarchy's level
-    spread     csr (node of the hierarchy's level, node of level `number`): interpolation to all of them
+    Attributes
+    ----------
+    places
+        (node of level `number`,) where its nodes stand among those of the hierarchy's level.
+    spread
+        csr (node of the hierarchy's level, node of level `number`): interpolation to all of them.
     """
 
     hierarchy: Graphs

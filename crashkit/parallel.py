@@ -1,0 +1,119 @@
+"""Jobs in this process or on Dask workers: the one way to several processes.
+
+Nothing depends on who does the work: a job gets an item and what all jobs share, and gives a result.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar
+
+from crashkit.errors import CrashkitError
+from crashkit.extras import need
+
+Item = TypeVar("Item")
+Shared = TypeVar("Shared")
+Result = TypeVar("Result")
+
+
+def as_finished(
+    job: Callable[[Item, Shared], Result],
+    items: Sequence[Item],
+    shared: Shared,
+    *,
+    workers: int = 1,
+    scheduler: str | None = None,
+    label: Callable[[Item], str] = str,
+    patience: float = 30.0,
+) -> Iterator[tuple[int, Result]]:
+    """Do one job an item and give (place of the item, result) as they finish.
+
+    Parameters
+    ----------
+    job
+        A function of a module, so that it can be sent to other processes.
+    items
+        One a job.
+    shared
+        What every job needs besides. It is sent to a worker once, and all jobs there get the same object.
+    workers
+        1 works here; more start as many processes, with one thread each, which end with the last job.
+    scheduler
+        Address of a Dask scheduler whose workers do it instead; they must see the same files.
+    label
+        What an item is called in an error.
+    patience
+        Seconds after which a scheduler that does not answer is given up.
+
+    Raises
+    ------
+    CrashkitError
+        For fewer than one worker, a scheduler out of reach, or a worker that died; MissingExtraError without Dask.
+        What a job raises is passed on.
+    """
+    if workers < 1:
+        raise CrashkitError(f"{workers} workers were asked for; expected at least 1")
+    if scheduler is None and (workers == 1 or len(items) < 2):
+        return ((place, job(item, shared)) for place, item in enumerate(items))
+    need("working in several processes", "distributed")
+    return _on_workers(job, items, shared, min(workers, len(items)), scheduler, label, patience)
+
+
+def _on_workers(
+    job: Callable[[Item, Shared], Result],
+    items: Sequence[Item],
+    shared: Shared,
+    workers: int,
+    scheduler: str | None,
+    label: Callable[[Item], str],
+    patience: float,
+) -> Iterator[tuple[int, Result]]:
+    from concurrent.futures import CancelledError
+
+    from distributed import as_completed
+    from distributed.comm.core import CommClosedError
+    from distributed.scheduler import KilledWorker
+
+    with _client(workers, scheduler, patience) as client:
+        (there,) = client.scatter([shared], broadcast=True, hash=False)
+        places = {client.submit(job, item, there, pure=False, retries=0): k for k, item in enumerate(items)}
+        for future in as_completed(list(places)):
+            place = places[future]
+            try:
+                result = future.result()
+            except (KilledWorker, CommClosedError, CancelledError) as error:
+                raise CrashkitError(
+                    f"{label(items[place])}: its worker died ({error}); see that it has memory enough, or use fewer workers"
+                ) from error
+            future.release()
+            yield place, result
+
+
+@contextlib.contextmanager
+def _client(workers: int, scheduler: str | None, patience: float) -> Iterator[Any]:
+    """A client of the scheduler at that address, or of processes of our own."""
+    import dask
+    from distributed import Client, LocalCluster
+
+    with contextlib.ExitStack() as stack:
+        if scheduler is None:
+            scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="crashkit-", ignore_cleanup_errors=True))
+            stack.enter_context(dask.config.set({"temporary-directory": scratch}))  # the scheduler's, too
+            cluster = LocalCluster(
+                n_workers=workers, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0",
+                memory_limit=0, silence_logs=logging.CRITICAL,
+            )  # fmt: skip
+            address: Any = stack.enter_context(cluster)
+        else:
+            address = scheduler
+        try:
+            client = stack.enter_context(Client(address, timeout=patience))
+        except (OSError, ValueError) as error:
+            raise CrashkitError(
+                f"{scheduler}: no Dask scheduler answers there ({error}); start one with `dask scheduler`, or take workers of "
+                "this machine"
+            ) from error
+        yield client
