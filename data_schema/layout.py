@@ -31,6 +31,8 @@ DIMENSIONS: Mapping[str, str] = MappingProxyType(
         "cell_corner": "corner of a cell",
         "source_state": "one output state of a run before the runs were brought to a common time",
         "tensor": "the components xx, yy, zz, xy, yz, zx of a symmetric tensor",
+        "sample": "one sample of a run's time histories, at a time of the run's own",
+        "channel": "one curve of the time histories, such as internal_energy",
     }
 )
 
@@ -140,6 +142,25 @@ VARIABLES: Mapping[str, Variable] = MappingProxyType(
                 kind="U",
                 unit="",
                 meaning="SHA-256 of the run's results, as `data_schema.checksum` takes it",
+            ),
+            _variable(
+                "history",
+                "sim sample channel",
+                kind="f",
+                unit="",
+                meaning="time histories; each channel in its own unit (`channel_unit`), NaN where a run lacks it",
+            ),
+            _variable(
+                "history_time",
+                "sim sample",
+                kind="f",
+                unit="s",
+                meaning="times of the samples, NaN behind a run's last",
+            ),
+            _variable("channel", "channel", kind="U", unit="", meaning="name of the curve, unique"),
+            _variable("channel_unit", "channel", kind="U", unit="", meaning="unit of the curve, such as J or N"),
+            _variable(
+                "channel_note", "channel", kind="U", unit="", meaning="what was done to the solver's own numbers"
             ),
             _variable("complete", "sim", kind="b", unit="", meaning="every state was found and the end time reached"),
         )

@@ -24,6 +24,7 @@ _QUANTITIES = MappingProxyType(
         "force": ((1, -2, 1), "N"),
         "stress": ((-1, -2, 1), "Pa"),
         "energy": ((2, -2, 1), "J"),
+        "momentum": ((1, -1, 1), "kg m s-1"),
         "specific energy": ((2, -2, 0), "J kg-1"),
         "power": ((2, -3, 1), "W"),
         "moment": ((2, -2, 1), "N m"),

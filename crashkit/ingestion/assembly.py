@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from crashkit.errors import OutputError, ReadError
 from crashkit.ingestion import store
 from crashkit.ingestion.alignment import same_time
+from crashkit.ingestion.curves import CURVES, Curves, curves_of, read_curves, with_curves
 from crashkit.ingestion.staging import BackgroundHashes, StagedRun, Staging
 from crashkit.ingestion.store import ArraySpec, RunSource
 from crashkit.ingestion.structure import Structure
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 # Variables that chunks are moved for; everything else is small and written anew.
-_SMALL = ("alignment_error", "complete", "run_checksum", "source_time")
+_SMALL = ("alignment_error", "complete", "run_checksum", "source_time", *CURVES)
 
 
 @dataclass(frozen=True)
@@ -166,8 +167,11 @@ def _small(
     import xarray as xr
 
     s, fresh = layout.structure, next(iter(new.values()))
+    places = dict(zip(names, (r.store for r in runs), strict=True))
     rows = [
-        _OfRun.kept(old, n) if old is not None and n not in new else _OfRun.new(new[n], staged[n], layout.time)
+        _OfRun.kept(old, n)
+        if old is not None and n not in new
+        else _OfRun.new(new[n], staged[n], layout.time, read_curves(places[n]))
         for n in names
     ]
     ds = xr.Dataset(
@@ -206,6 +210,7 @@ def _small(
         ds["cell_id"] = ("cell", s.cell_id, {"long_name": "the solver's element number"})
     if any(r.source_time is not None for r in rows):
         ds["source_time"] = (("sim", "source_state"), _padded(rows, layout.time), {"units": "s"})
+    ds = with_curves(ds, [r.curves for r in rows])
     units = old.parameters if old is not None else {n: u for n, (_, u) in fresh.parameters.items()}
     for name, unit in units.items():
         values = np.array([r.parameters[name] for r in rows], np.float64)
@@ -248,12 +253,13 @@ class _OfRun:
     checksum: str
     parameters: Mapping[str, float]
     source_time: NDArray[np.float64] | None
+    curves: Curves | None
 
     @classmethod
-    def new(cls, found: Found, staged: StagedRun, time: NDArray[np.float64]) -> _OfRun:
+    def new(cls, found: Found, staged: StagedRun, time: NDArray[np.float64], curves: Curves | None) -> _OfRun:
         own = None if same_time(found.time, time) else found.time
         values = {n: v for n, (v, _) in found.parameters.items()}
-        return cls(found.complete, staged.error, run_checksum(staged.digests), values, own)
+        return cls(found.complete, staged.error, run_checksum(staged.digests), values, own, curves)
 
     @classmethod
     def kept(cls, old: Existing, name: str) -> _OfRun:
@@ -266,6 +272,7 @@ class _OfRun:
             checksum=str(of["run_checksum"].values),
             parameters={n: float(of[n]) for n in old.parameters},
             source_time=None if len(own) == 0 or same_time(own, old.time) else own,
+            curves=curves_of(of),
         )
 
 

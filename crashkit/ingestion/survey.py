@@ -305,6 +305,8 @@ def _look(run: Run, name: str, source: Path, index: int, choice: Choice, out: Su
     for field_name, wanted in fields.items():
         if wanted.unit == "unknown":
             out.note(f"field {field_name}: no source says its unit; the values stay as they are, labelled unknown")
+    if run.left_out:
+        out.note(f"left out of {source.name}: {', '.join(run.left_out)}")
     missing = [n for n in choice.fields if n not in fields]
     if missing:
         out.note(f"run {name} has no {', '.join(missing)}; it has {', '.join(run.fields) or 'no further field'}")

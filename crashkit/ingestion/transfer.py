@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from crashkit.errors import DataError
 from crashkit.ingestion.alignment import flags_at, interpolate, interpolation_error, same_time
+from crashkit.ingestion.curves import write_curves
 from crashkit.ingestion.run_view import Flags, RunView, gone_nodes
 from crashkit.ingestion.staging import StagedRun
 from crashkit.ingestion.store import ArraySpec, create_arrays
@@ -112,6 +113,7 @@ def transfer(found: Found, layout: Layout, key: str, place: Path) -> StagedRun:
         try:
             with ThreadPoolExecutor(THREADS, thread_name_prefix="write") as pool:
                 digests, error = _Transfer(run, found, layout, beside, pool).write()
+            write_curves(run, found.units, beside / "arrays")
         finally:
             run.close()
         shutil.rmtree(place, ignore_errors=True)

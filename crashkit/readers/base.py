@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from crashkit.readers.history import History
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,7 @@ class Run(ABC):
     fields      what `field` can give, by name
     units       unit system if the source states one ("SI"), else None: the user must say
     end_time    the end time the control data asks for, None where the source does not say
+    left_out    what the source holds and this reader does not give, by name
     problems    reasons why the run is incomplete or damaged though it can be opened; ingest refuses such runs
     """
 
@@ -98,6 +101,7 @@ class Run(ABC):
     fields: Mapping[str, FieldInfo]
     units: str | None = None
     end_time: float | None = None
+    left_out: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()
 
     @abstractmethod
@@ -114,6 +118,13 @@ class Run(ABC):
 
     def alive_cells(self, first: int, last: int) -> NDArray[np.bool_] | None:
         """(state, cell) the same for solids and beams."""
+        return None
+
+    def history(self) -> History | None:
+        """Curves of energies, forces and the like, at times of their own; None where the source holds none.
+
+        Raises ReadError where they are there and cannot be read.
+        """
         return None
 
     def close(self) -> None:  # noqa: B027 - most readers hold nothing open
@@ -159,6 +170,24 @@ class Reader(Protocol):
 
         Raises crashkit.errors.ReadError, naming the file and the place in it.
         """
+
+
+def distinct_parts(parts: Sequence[Part]) -> tuple[Part, ...]:
+    """The parts, each with a number of its own: solvers count shells, beams and rigid bodies from 1 each.
+
+    The first part of a number keeps it; later ones get the next numbers behind the largest. A wall may share one: it is
+    no part of the structure.
+    """
+    out: list[Part] = []
+    used: set[int] = set()
+    free = max((p.id for p in parts), default=0) + 1
+    for part in parts:
+        if part.id in used and not part.rigid_wall:
+            part, free = replace(part, id=free), free + 1
+        if not part.rigid_wall:
+            used.add(part.id)
+        out.append(part)
+    return tuple(out)
 
 
 def split_states(count: int, nodes: int, budget: int = 64 << 20) -> Sequence[tuple[int, int]]:

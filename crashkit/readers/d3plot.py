@@ -26,12 +26,14 @@ from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
 from crashkit.readers import register
+from crashkit.readers._binout import binout_files, read_binout
 from crashkit.readers._cells import LINE, VERTEX, shell_faces, solid_cells, stack_cells
 from crashkit.readers._checks import require_finite, require_indices, require_options, time_problems
 from crashkit.readers._d3plot_file import D3plotFile, word_size
 from crashkit.readers._folders import runs_in
 from crashkit.readers._names import WALL_NAME, quantity
 from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh, Runs
+from crashkit.readers.history import History
 
 _RIGID = 20
 _DECK_SUFFIXES = (".k", ".key", ".dyn")
@@ -124,6 +126,11 @@ class _D3plotRun(Run):
             *self._file.problems,
             *time_problems(self.time, [self._place(k) for k in range(len(self.time))]),
         )
+
+    def history(self) -> History | None:
+        """The curves of the binout family beside the d3plot, where there is one."""
+        files = binout_files(self.files[0].parent)
+        return read_binout(files) if files else None
 
     def _place(self, state: int) -> str:
         at = self._file.states[state]

@@ -4,6 +4,11 @@
     kart/reference_configuration  (run, node, 3), or (node, 3) where all runs start alike
     kart/faces                    (triangle, 3), 0-based; or a mesh file beside it (option `mesh`)
     kart/<field>                  (run, state, node | face [, 3]), such as plastic_strain
+    kart/alive                    (run, state, face), 0 once an element has eroded
+    kart/part, part_id, part_name (face,) place among the parts, (part,) their numbers and (part,) titles
+    kart/node_id, element_id      (node,), (face,) the solver's numbers
+    history/<curve>               (run, sample), with attribute `units`; history/time (sample,) or (run, sample)
+    run                           (run,) the campaign's own numbers, which name the runs
     parameter                     (run, parameter), with attributes `names` and `units`
     time                          (state,), or (run, state)
 
@@ -36,6 +41,7 @@ from crashkit.readers._checks import (
 )
 from crashkit.readers._names import quantity
 from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh, Runs
+from crashkit.readers.history import Channel, History
 
 if TYPE_CHECKING:
     import h5py
@@ -43,6 +49,10 @@ if TYPE_CHECKING:
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 _NEEDED = ("displacements", "reference_configuration")
 _KART_PARAMETERS = (("impact_speed", "m s-1"), ("impact_angle", "degree"), ("yield_stress", "MPa"))
+_CURVES = {
+    "energy": "energy", "work": "energy", "momentum": "momentum", "force": "force", "moment": "moment",
+    "acceleration": "acceleration", "velocity": "velocity", "displacement": "length", "mass": "mass",
+}  # fmt: skip
 _METRE = ("m", "metre", "meter")
 # One chunk may hold all states of a run; the cache keeps it while its states are read slice by slice.
 _CHUNK_CACHE = 96 << 20
@@ -121,12 +131,100 @@ class _Campaign:
         self.faces = self._faces(mesh)
         self.time = self._time()
         self.parameters = self._parameters()
+        self.numbers = self._numbers()
+        self.alive = self._if_there("alive", (self.runs, self.states, len(self.faces)))
+        self.parts, self.face_part = self._parts()
+        self.node_id = self._identities("node_id", self.nodes)
+        self.face_id = self._identities("element_id", len(self.faces))
         self.fields = self._fields()
+        self.curves = self._curves()
+        self.left_out = self._left_out()
         unit = _text(self.displacements.attrs.get("units", ""))
         self.units = "SI" if unit in _METRE else None
 
     def name(self, index: int) -> str:
-        return f"run_{index:0{max(3, len(str(self.runs - 1)))}d}"
+        number = int(self.numbers[index])
+        return f"run_{number:0{max(3, len(str(int(self.numbers.max()))))}d}"
+
+    def _if_there(self, name: str, shape: tuple[int, ...]) -> h5py.Dataset | None:
+        """The dataset `name`, whose shape must be `shape`; None where there is none."""
+        import h5py
+
+        if not isinstance(self.file[self.group].get(name, self.file.get(name)), h5py.Dataset):
+            return None
+        found = self._dataset(name)
+        if found.shape != shape:
+            raise self._wrong(name, str(shape))
+        return found
+
+    def _numbers(self) -> NDArray[np.int64]:
+        """The campaign's own numbers of its runs; 0, 1, 2, ... where it has none."""
+        found = self._if_there("run", (self.runs,))
+        if found is None:
+            return np.arange(self.runs)
+        numbers = self.read(found, ...).astype(np.int64)
+        if len(np.unique(numbers)) != self.runs or numbers.min() < 0:
+            raise ReadError(
+                f"{self.path}: {found.name} holds numbers twice or below 0; expected a number of its own per run"
+            )
+        return np.asarray(numbers)
+
+    def _identities(self, name: str, count: int) -> NDArray[np.int64]:
+        found = self._if_there(name, (count,))
+        return np.arange(1, count + 1) if found is None else self.read(found, ...).astype(np.int64)
+
+    def _parts(self) -> tuple[tuple[Part, ...], NDArray[np.int32]]:
+        """The parts, and the part (face,) of each face."""
+        whole = (Part(1, self.group.strip("/") or "structure"),)
+        found = self._if_there("part", (len(self.faces),))
+        if found is None:
+            return whole, np.zeros(len(self.faces), np.int32)
+        places = self.read(found, ...).astype(np.int64)
+        home = self.file[self.group]
+        known = np.asarray(home["part_id"][...]) if "part_id" in home else np.unique(places)
+        # Either places among the parts from 0, or the parts' own numbers.
+        if not (np.isin(places, known).all() and places.min() >= known.min()):
+            require_indices(places, len(known), "part", f"{self.path}: {found.name}")
+        else:
+            order = np.argsort(known)
+            places = order[np.searchsorted(known[order], places)]
+        names = [_text(n) for n in home["part_name"][...]] if "part_name" in home else [""] * len(known)
+        if len(names) != len(known):
+            raise ReadError(f"{self.path}: {len(names)} part_name and {len(known)} part_id; expected as many of each")
+        return tuple(Part(int(k), n or f"part {k}") for k, n in zip(known, names, strict=True)), places.astype(np.int32)
+
+    def _curves(self) -> dict[str, h5py.Dataset]:
+        """Time histories (run, sample) by name, with "time"; empty where there are none."""
+        import h5py
+
+        home = self.file.get("history", self.file[self.group].get("history"))
+        if not isinstance(home, h5py.Group) or not isinstance(home.get("time"), h5py.Dataset):
+            return {}
+        shape = home["time"].shape
+        if shape not in ((shape[-1],), (self.runs, shape[-1])):
+            raise ReadError(
+                f"{self.path}: {home.name}/time has shape {shape}, expected (sample,) or ({self.runs}, sample)"
+            )
+        wanted = (self.runs, shape[-1])
+        return {n: d for n, d in home.items() if n == "time" or (isinstance(d, h5py.Dataset) and d.shape == wanted)}
+
+    def _left_out(self) -> tuple[str, ...]:
+        """Names of datasets that are not read."""
+        import h5py
+
+        used = {
+            "displacements", "reference_configuration", "faces", "parameter", "time", "run", "alive", "part", "part_id",
+            "part_name", "node_id", "element_id", *self.fields,
+        }  # fmt: skip
+        curves = {d.name for d in self.curves.values()}
+        out: list[str] = []
+
+        def look(name: str, found: object) -> None:
+            if isinstance(found, h5py.Dataset) and name.split("/")[-1] not in used and found.name not in curves:
+                out.append(name)
+
+        self.file.visititems(look)
+        return tuple(sorted(out))
 
     def _dataset(self, name: str, *dimensions: int) -> h5py.Dataset:
         import h5py
@@ -201,7 +299,11 @@ class _Campaign:
 
         fields = {}
         for name, found in self.file[self.group].items():
-            if not isinstance(found, h5py.Dataset) or found.dtype.kind not in "fiu" or name == "displacements":
+            if (
+                not isinstance(found, h5py.Dataset)
+                or found.dtype.kind not in "fiu"
+                or name in ("displacements", "alive")
+            ):
                 continue
             if found.shape[:2] != (self.runs, self.states) or found.ndim not in (3, 4):
                 continue
@@ -225,17 +327,18 @@ class _KartRun(Run):
         self.parameters: Mapping[str, Parameter] = campaign.parameters[index]
         self.fields: Mapping[str, FieldInfo] = campaign.fields
         self.units = campaign.units
+        self.left_out = campaign.left_out
         reference = campaign.reference
         position = campaign.read(reference, *((index,) if reference.ndim == 3 else (...,))).astype(np.float64)
         require_finite(position, "the reference position", f"{campaign.path}: {reference.name}, {self.name}")
         faces = campaign.faces
         self.mesh = RunMesh(
             position=position,
-            node_id=np.arange(1, len(position) + 1),
+            node_id=campaign.node_id,
             face_nodes=faces,
-            face_part=np.zeros(len(faces), np.int32),
-            face_id=np.arange(1, len(faces) + 1),
-            parts=(Part(1, campaign.group.strip("/") or "structure"),),
+            face_part=campaign.face_part,
+            face_id=campaign.face_id,
+            parts=campaign.parts,
         )
         self.problems = tuple(
             time_problems(self.time, [f"{campaign.path}: time, {self.name}, state {k}" for k in range(len(self.time))])
@@ -251,11 +354,34 @@ class _KartRun(Run):
             require_finite(state, "the displacement", f"{self._place('displacements')}, state {k}")
         return values
 
+    def alive(self, first: int, last: int) -> NDArray[np.bool_] | None:
+        found = self._campaign.alive
+        return None if found is None else self._campaign.read(found, self._index, slice(first, last)) != 0
+
+    def history(self) -> History | None:
+        curves = self._campaign.curves
+        if len(curves) < 2:
+            return None
+        names = [n for n in curves if n != "time"]
+        time = curves["time"]
+        times = self._campaign.read(time, *((self._index,) if time.ndim == 2 else (...,))).astype(np.float64)
+        channels = tuple(Channel(n, _curve_quantity(n)) for n in names)
+        values = [self._campaign.read(curves[n], self._index).astype(np.float64) for n in names]
+        return History(times, channels, np.stack(values, axis=1))
+
     def field(self, name: str, first: int, last: int) -> NDArray[np.float32]:
         if name not in self.fields:
             raise KeyError(name)
         dataset = self._campaign.file[self._campaign.group][name]
         return self._campaign.read(dataset, self._index, slice(first, last)).astype(np.float32, copy=False)
+
+
+def _curve_quantity(name: str) -> str:
+    """What a curve measures, told by its name: "wall_force_x" is a force."""
+    for word, kind in _CURVES.items():
+        if word in name:
+            return kind
+    return "unknown"
 
 
 def _text(value: object) -> str:

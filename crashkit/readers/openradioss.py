@@ -30,7 +30,9 @@ from crashkit.readers._checks import require_finite, require_indices, require_op
 from crashkit.readers._folders import runs_in
 from crashkit.readers._names import DISPLACEMENT_NAMES, WALL_NAME, field_name, quantity
 from crashkit.readers._radioss_file import Array, Content, beginning, read_layout, starts_well
-from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh, Runs
+from crashkit.readers._radioss_history import read_history
+from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh, Runs, distinct_parts
+from crashkit.readers.history import History
 
 _FILE = re.compile(r"(?P<root>.+)A(?P<number>\d{3,4})(?:\.gz)?")
 # Unpacked gzip files are kept up to this many bytes, so that a state's fields need not unpack it again.
@@ -109,6 +111,11 @@ class _RadiossRun(Run):
     def _root(self) -> str:
         match = _FILE.fullmatch(self._states[0].name)
         return match["root"] if match else ""
+
+    def history(self) -> History | None:
+        """The curves of NAMET01, where it stands beside the animation files."""
+        file = self._states[0].with_name(f"{self._root}T01")
+        return read_history(file) if file.is_file() else None
 
     # Files
 
@@ -194,7 +201,7 @@ class _RadiossRun(Run):
             face_nodes=shell_faces(content.array(shells.nodes)),
             face_part=owners["shell"].astype(np.int32),
             face_id=ids["shell"],
-            parts=tuple(parts),
+            parts=distinct_parts(parts),
             cell_nodes=stack_cells(cells),
             cell_type=np.concatenate([np.empty(0, np.uint8), *types]),
             cell_part=np.concatenate([np.empty(0, np.int32), *(owners[k] for k in self._cell_kinds)]).astype(np.int32),

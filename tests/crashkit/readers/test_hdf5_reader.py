@@ -163,3 +163,56 @@ def test_a_truncated_file_is_refused(tmp_path, share):
         list(reader_for(cut, "kart-hdf5").runs(cut))
     with pytest.raises(ReadError, match=r"cut\.h5.*cut short or damaged: copy it again"):
         reader_for(cut)
+
+
+@pytest.fixture
+def whole(campaign, sample):
+    """The same file with parts, the solver's numbers, erosion, curves, and something nobody reads."""
+    faces, states = len(sample.faces), len(sample.time)
+    with h5py.File(campaign, "a") as file:
+        home = file["kart"]
+        home["part"] = np.where(np.arange(faces) % 2, 7, 3)
+        home["part_id"] = np.array([7, 3])
+        home["part_name"] = np.array(["beam", "box"], dtype=h5py.string_dtype())
+        home["node_id"] = np.arange(len(sample.points)) + 1000
+        home["element_id"] = np.arange(faces) + 500
+        alive = np.ones((2, states, faces), np.uint8)
+        alive[1, -1, 0] = 0
+        home["alive"] = alive
+        file["run"] = np.array([12, 96])
+        file["history/time"] = np.linspace(0, 0.01, 5)
+        file["history/internal_energy"] = np.arange(10.0).reshape(2, 5)
+        file["history/wall_force_x"] = -np.arange(10.0).reshape(2, 5)
+        file["pole_x"] = np.zeros(2)
+    return campaign
+
+
+def test_parts_numbers_and_erosion_of_the_file_are_read(whole, sample):
+    first, second = read(whole)
+    assert (first.name, second.name) == ("run_012", "run_096")
+    assert [(p.id, p.name) for p in first.mesh.parts] == [(7, "beam"), (3, "box")]
+    assert first.mesh.face_part.tolist()[:2] == [1, 0]
+    assert first.mesh.node_id[0] == 1000
+    assert first.mesh.face_id[0] == 500
+    assert first.alive(0, len(sample.time)).all()
+    assert not second.alive(len(sample.time) - 1, len(sample.time))[0, 0]
+    assert "alive" not in second.fields
+
+
+def test_curves_of_the_file_have_what_they_measure(whole):
+    history = read(whole)[1].history()
+    assert history.time.tolist() == np.linspace(0, 0.01, 5).tolist()
+    assert {c.name: c.quantity for c in history.channels} == {"internal_energy": "energy", "wall_force_x": "force"}
+    energy = [c.name for c in history.channels].index("internal_energy")
+    assert history.values[:, energy].tolist() == [5.0, 6.0, 7.0, 8.0, 9.0]
+
+
+def test_what_is_not_read_is_named(whole):
+    assert read(whole)[0].left_out == ("pole_x",)
+
+
+def test_runs_numbered_twice_are_refused(whole):
+    with h5py.File(whole, "a") as file:
+        file["run"][...] = [5, 5]
+    with pytest.raises(ReadError, match="twice"):
+        read(whole)
