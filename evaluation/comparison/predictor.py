@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
@@ -108,3 +109,13 @@ class Model:
     checksum: str = ""
     seed: int | None = None
     configuration: Mapping[str, object] = field(default_factory=dict)
+
+
+def array_names(models: Sequence[Model]) -> dict[tuple[str, str], str]:
+    """(model, predictor) -> what its arrays are called: the predictor, and the model where two models have it."""
+    every = [p.name for m in models for p in m.predictors]
+    return {
+        (m.name, p.name): re.sub(r"[./]", "_", p.name if every.count(p.name) == 1 else f"{p.name}_{m.name}")
+        for m in models
+        for p in m.predictors
+    }

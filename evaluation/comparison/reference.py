@@ -17,6 +17,15 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
+class Result:
+    """A further result of a run, such as plastic strain: `values` (state, node | face | cell, ...), and what it is on."""
+
+    values: NDArray[np.floating]
+    on: str
+    unit: str
+
+
+@dataclass(frozen=True)
 class Reference:
     """Everything about the runs but their fields, and a way to read these.
 
@@ -42,6 +51,12 @@ class Reference:
         (face, 3 or 4) int32, -1 in the last corner of a triangle among quadrilaterals.
     face_part
         (face,) int32 index into `part_names`.
+    face_id
+        (face,) the solver's numbers of the elements; None where nobody says.
+    fields
+        Run number -> its further results by name; None where there are none.
+    table_units
+        For each parameter the unit people write it in and its value in `parameter_units`, such as ("MPa", 1e6).
     """
 
     runs: tuple[str, ...]
@@ -61,6 +76,14 @@ class Reference:
     attributes: Mapping[str, str] = field(default_factory=dict)
     positions: Callable[[int], NDArray[np.float64]] | None = None
     alive: Callable[[int], NDArray[np.bool_]] | None = None
+    face_id: NDArray[np.integer] | None = None
+    fields: Callable[[int], Mapping[str, Result]] | None = None
+    table_units: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def written(self) -> tuple[tuple[str, float], ...]:
+        """`table_units`, or the parameters' own units where they say nothing."""
+        return self.table_units or tuple((unit, 1.0) for unit in self.parameter_units)
 
     @property
     def n_nodes(self) -> int:
@@ -119,9 +142,15 @@ def reference_of(
     dataset: xr.Dataset, levels: Sequence[Level] = (), attributes: Mapping[str, str] | None = None
 ) -> Reference:
     """The runs of a crash dataset (`data_schema`); reads no field until one is asked for."""
-    from data_schema import parameters
+    from data_schema import fields, parameters, table_unit
 
     names = tuple(parameters(dataset))
+    results = fields(dataset)
+
+    def further(run: int) -> dict[str, Result]:
+        found = {name: dataset[name].isel(sim=run) for name in results}
+        return {n: Result(a.values, str(a.dims[1]), str(a.attrs.get("units", ""))) for n, a in found.items()}
+
     position = dataset["reference_position"]
     displacement = dataset["displacement"]
     by_run = "sim" in position.dims
@@ -146,4 +175,7 @@ def reference_of(
         attributes={str(k): str(v) for k, v in dataset.attrs.items()} | dict(attributes or {}),
         positions=(lambda k: position.isel(sim=k).values.astype(np.float64)) if by_run else None,
         alive=(lambda k: life.isel(sim=k).values.astype(bool)) if life is not None else None,
+        face_id=dataset["face_id"].values if "face_id" in dataset.variables else None,
+        fields=further if results else None,
+        table_units=tuple(table_unit(dataset, name) for name in names),
     )

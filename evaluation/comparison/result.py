@@ -65,6 +65,11 @@ class Evaluation:
         model, number = entry.keys[seed]
         return self.models[model].predictors[number]
 
+    @property
+    def first_seeds(self) -> list[Model]:
+        """One model a row: further seeds are not drawn or written."""
+        return [self.models[m] for m in sorted({entry.keys[0][0] for entry in self.entries})]
+
     def model(self, entry: Entry, seed: int = 0) -> Model:
         """The model that one seed of `entry` belongs to."""
         return self.models[entry.keys[seed][0]]

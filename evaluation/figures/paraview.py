@@ -19,10 +19,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FromFile:
-    """path of a .pvd or .vtkhdf file with the arrays displacement and predicted, and the model that predicted."""
+    """path of a .pvd or .vtkhdf file with the arrays displacement and predicted_NAME, the model, and that name."""
 
     path: Path
     model: str
+    array: str
 
     def numbers(self) -> Columns:
         from crashkit.writers.paraview import read_state
@@ -40,29 +41,31 @@ class FromFile:
     def draw(self, sheet: Sheet) -> Figure:
         from evaluation.drawing.pictures import file_picture
 
-        return file_picture(self.path, name=self.model, sheet=sheet)
+        return file_picture(self.path, name=self.model, sheet=sheet, prediction=f"predicted_{self.array}")
 
     def caption(self) -> str:
         arrays = self.numbers()["array"]
         return (
             f"The last state of {self.path.name}, read back from the file: truth, prediction of {self.model} and "
-            f"error. In "
-            f"ParaView, open the file and warp by displacement or predicted. Arrays: "
+            f"error. In ParaView, open the file and warp by displacement or predicted_{self.array}. Arrays: "
             f"{', '.join(arrays)}; lengths in metres."
         )
 
 
 def select(evaluation: Evaluation) -> FromFile | None:
     from crashkit.output import file_name
+    from evaluation.comparison.predictor import array_names
     from evaluation.drawing.rendering import rendering_problem
 
-    best = evaluation.ranked[0]
-    ending = file_name(evaluation.model(best).name)
-    found = [p for p in evaluation.files if p.suffix in (".pvd", ".vtkhdf") and p.stem.endswith(f"_{ending}")]
+    best = evaluation.model(evaluation.ranked[0])
+    runs = {file_name(name) for name in evaluation.test_names}
+    found = [p for p in evaluation.files if p.suffix in (".pvd", ".vtkhdf") and p.stem in runs]
     if not found or rendering_problem() is not None:
         return None
-    finest = evaluation.model(best).predictors[0].name
-    return FromFile(found[0], finest)
+    finest = best.predictors[0].name
+    # Where the best model is a further seed, the file holds the first seed of its row.
+    first = next(m for m in evaluation.first_seeds if m.configuration == best.configuration)
+    return FromFile(found[0], finest, array_names(evaluation.first_seeds)[first.name, finest])
 
 
 FIGURE = Kind("paraview", "The files for ParaView", select, raster=True)

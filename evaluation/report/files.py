@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.output import file_name
-from crashkit.writers.paraview import write_paraview
-from evaluation.comparison.predictor import Model, Predictor
+from crashkit.writers.paraview import rounded, write_paraview
+from evaluation.comparison.predictor import Model, Predictor, array_names
 from evaluation.comparison.reference import Reference
 from evaluation.comparison.result import Evaluation
 from evaluation.comparison.scoring import contributions, full_field, mesh_of
 
 # Bytes of one predicted field held at once; several of them are.
 _BUDGET = 64 << 20
-_METRES = ("displacement", "predicted", "error", "error_magnitude")
+_METRES = ("displacement", "predicted", "error", "contribution_")
 
 
 def default_runs(evaluation: Evaluation) -> tuple[int, ...]:
@@ -31,23 +31,25 @@ def default_runs(evaluation: Evaluation) -> tuple[int, ...]:
 
 
 def write_run(evaluation: Evaluation, run: int, folder: Path, formats: Sequence[str] = (".pvd",)) -> list[Path]:
-    """Write run number `run` for every model of `evaluation` into `folder`, as `.pvd` with VTU or as `.vtkhdf`.
+    """Write run number `run` with the predictions of all models into `folder`, as `.pvd` with VTU or as `.vtkhdf`.
 
-    `RUN_MODEL` stands on the full mesh, with the arrays displacement (true), predicted, error (vector), its
-    magnitude, for a cascade the contribution of each level, and coarsest_level: the coarsest level that keeps a
-    node, 0 for none. `RUN_NAME_levelN` is the coarse mesh of level N with its own prediction.
-    Returns the files, those to open first. A few states are in memory at a time.
+    `RUN` stands on the full mesh. Its arrays are displacement (true); predicted_MODEL and the distance from the truth,
+    error_MODEL, of every model; contribution_LEVEL of a cascade; coarsest_level, the coarsest level that keeps a node
+    (0 for none); the fields that were ingested; numbers of nodes, elements and parts. Parameters and names of parts and
+    models are field data. `RUN_MODEL_levelN` is the coarse mesh of level N with its own prediction. Predictions are
+    rounded far below their error (`crashkit.writers.paraview.rounded`).
+
+    Returns the files to open. A few states are in memory at a time.
     """
     reference = evaluation.reference
     truth = reference.displacement(run)
-    written = []
-    for model in _first_seeds(evaluation):
-        name = file_name(f"{reference.runs[run]}_{model.name}")
-        written += _write_full(reference, model, run, truth, folder / name, formats)
+    models = evaluation.first_seeds
+    written = _write_full(reference, models, run, truth, folder / file_name(reference.runs[run]), formats)
+    for model in models:
         for predictor in model.predictors:
             if predictor.level > 0:
                 name = file_name(f"{reference.runs[run]}_{model.name}_level{predictor.level}")
-                written += _write_coarse(reference, predictor, run, truth, folder / name, formats)
+                written += _write_coarse(reference, model, predictor, run, truth, folder / name, formats)
     return written
 
 
@@ -57,12 +59,6 @@ def coarsest_level(reference: Reference) -> NDArray[np.int8]:
     for level in reference.levels:
         out[level.kept] = level.index
     return out
-
-
-def _first_seeds(evaluation: Evaluation) -> list[Model]:
-    """One model a row: further seeds are not drawn."""
-    numbers = sorted({entry.keys[0][0] for entry in evaluation.entries})
-    return [evaluation.models[m] for m in numbers]
 
 
 @dataclass
@@ -103,65 +99,110 @@ def _step(reference: Reference) -> int:
 
 
 def _write_full(
-    reference: Reference, model: Model, run: int, truth: NDArray[np.float32], path: Path, formats: Sequence[str]
+    reference: Reference,
+    models: Sequence[Model],
+    run: int,
+    truth: NDArray[np.float32],
+    path: Path,
+    formats: Sequence[str],
 ) -> list[Path]:
-    parameters = reference.parameters[run]
-    coarsest_first = sorted(model.predictors, key=lambda p: -p.level)
+    parameters, names, size = reference.parameters[run], array_names(models), _size(reference.position)
 
     def compute(states: slice) -> dict[str, NDArray[Any]]:
-        lifted = {
-            p.name: full_field(reference, p, p.predict(parameters, reference.time[states]), states.stop - states.start)
-            for p in coarsest_first
-        }
-        out = _errors(truth[states], lifted[coarsest_first[-1].name])
-        if len(lifted) > 1:
-            out |= {f"contribution_{name}": field for name, field in contributions(lifted).items()}
+        out = {"displacement": truth[states]}
+        for model in models:
+            lifted = {
+                names[model.name, p.name]: full_field(
+                    reference, p, p.predict(parameters, reference.time[states]), states.stop - states.start
+                )
+                for p in sorted(model.predictors, key=lambda p: -p.level)
+            }
+            finest = list(lifted)[-1]
+            out[f"predicted_{finest}"] = rounded(lifted[finest], size)
+            out[f"error_{finest}"] = rounded(_distance(lifted[finest], truth[states]), size)
+            if len(lifted) > 1:
+                added = contributions(lifted)
+                out |= {f"contribution_{name}": rounded(field, size) for name, field in added.items()}
         return out
 
     blocks = _Blocks(compute, len(reference.time), _step(reference))
-    data: dict[str, Any] = dict(blocks.fields())
+    data: dict[str, Any] = {**blocks.fields(), "node_id": _small(reference.node_id)}
+    cells: dict[str, Any] = {"part_id": _small(reference.part_id[reference.face_part])}
     if reference.levels:
         data["coarsest_level"] = coarsest_level(reference)
-    alive = None if reference.alive is None else reference.alive(run)
-    written = []
-    for suffix in formats:
-        written += write_paraview(
+    if reference.face_id is not None:
+        cells["element_id"] = _small(reference.face_id)
+    units = _units(data)
+    for name, field in (reference.fields(run) if reference.fields is not None else {}).items():
+        if field.on in ("node", "face"):
+            (data if field.on == "node" else cells)[name] = field.values
+            units |= {name: field.unit} if field.unit else {}
+    about = {"models": ", ".join(dict.fromkeys(m.name for m in models)), **_about(reference, run)}
+    return [
+        write_paraview(
             path.parent / (path.name + suffix), reference.position_of(run), reference.faces, reference.time, data,
-            units=_units(data), alive=alive,
-        )[:1]  # fmt: skip
-    return written
+            cells, units=units, alive=None if reference.alive is None else reference.alive(run), field_data=about,
+        )[0]
+        for suffix in formats
+    ]  # fmt: skip
 
 
 def _write_coarse(
-    reference: Reference, predictor: Predictor, run: int, truth: NDArray[np.float32], path: Path, formats: Sequence[str]
+    reference: Reference,
+    model: Model,
+    predictor: Predictor,
+    run: int,
+    truth: NDArray[np.float32],
+    path: Path,
+    formats: Sequence[str],
 ) -> list[Path]:
     level = mesh_of(reference, predictor)
     if level is None:
         return []
-    own = truth[:, level.kept]
-    data: dict[str, Any] = dict(_errors(own, predictor.predict(reference.parameters[run], reference.time)))
-    data["node_id"] = reference.node_id[level.kept]
-    written = []
-    for suffix in formats:
-        written += write_paraview(
-            path.parent / (path.name + suffix), reference.position_of(run)[level.kept], level.faces, reference.time,
-            data, lines=lone_edges(level.faces, level.edges), units=_units(data),
-        )[:1]  # fmt: skip
-    return written
-
-
-def _errors(truth: NDArray[np.float32], predicted: NDArray[np.floating]) -> dict[str, NDArray[Any]]:
-    error = (predicted - truth).astype(np.float32)
-    return {
-        "displacement": truth,
-        "predicted": predicted.astype(np.float32),
-        "error": error,
-        "error_magnitude": np.linalg.norm(error, axis=-1),
+    own, size = truth[:, level.kept], _size(reference.position)
+    predicted = predictor.predict(reference.parameters[run], reference.time)
+    data: dict[str, Any] = {
+        "displacement": own,
+        "predicted": rounded(predicted, size),
+        "error": rounded(_distance(predicted, own), size),
+        "node_id": _small(reference.node_id[level.kept]),
     }
+    about = {"model": f"{predictor.name} of {model.name}", **_about(reference, run)}
+    return [
+        write_paraview(
+            path.parent / (path.name + suffix), reference.position_of(run)[level.kept], level.faces, reference.time,
+            data, lines=lone_edges(level.faces, level.edges), units=_units(data), field_data=about,
+        )[0]
+        for suffix in formats
+    ]  # fmt: skip
+
+
+def _about(reference: Reference, run: int) -> dict[str, Any]:
+    """Field data: the run, its parameters, and the parts."""
+    out: dict[str, Any] = {"run": reference.runs[run]}
+    for name, value, (unit, factor) in zip(
+        reference.parameter_names, reference.parameters[run], reference.written, strict=True
+    ):
+        out |= {name: value / factor, f"{name}_unit": unit}
+    return {**out, "part_name": list(reference.part_names), "part_number": np.asarray(reference.part_id)}
+
+
+def _distance(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float32]:
+    return np.linalg.norm(a - b, axis=-1).astype(np.float32)
+
+
+def _size(points: NDArray[np.float64]) -> float:
+    """The longest side of the box around `points`, m."""
+    return float(np.ptp(points, axis=0).max())
+
+
+def _small(numbers: NDArray[np.integer]) -> NDArray[np.integer]:
+    """Numbers in four bytes where they fit: they stand in every VTU of a series."""
+    return numbers.astype(np.int32) if abs(numbers).max(initial=0) < 2**31 else numbers
 
 
 def _units(data: Mapping[str, Any]) -> dict[str, str]:
-    return {name: "m" for name in data if name in _METRES or name.startswith("contribution_")}
+    return {name: "m" for name in data if name.startswith(_METRES)}
 
 
 def lone_edges(faces: NDArray[np.integer], edges: NDArray[np.integer]) -> NDArray[np.int64]:
