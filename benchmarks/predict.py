@@ -39,12 +39,12 @@ from torch_geometric.nn import ChebConv as PeerConv
 from train_step import median_turns
 
 from crashkit.mesh.hierarchy import build_hierarchy
-from surrogates.data.campaign import Campaign, GraphLevel
+from surrogates.data.campaign import Campaign
 from surrogates.data.graphs import Graphs
 from surrogates.data.inputs import InputScaling, Ranges
 from surrogates.data.samples import Split
 from surrogates.models.cascade import Cascade, build_level
-from surrogates.models.level import Level
+from surrogates.models.level import LevelNetwork
 from surrogates.record import Record
 from surrogates.regression.latent_process import LatentProcess
 from surrogates.settings import Settings, settings
@@ -80,10 +80,7 @@ def mesh_of(file: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def graphs_of(points: np.ndarray, faces: np.ndarray, nodes: list[int]) -> Graphs:
     hierarchy = build_hierarchy(points, faces, nodes)
-    levels = (
-        GraphLevel(k.index, k.kept, k.faces, k.edges, k.in_finer, k.to_finer, k.to_full) for k in hierarchy.levels
-    )
-    return Graphs(len(points), tuple(levels))
+    return Graphs(len(points), hierarchy.levels)
 
 
 def untrained(chosen: Settings, graphs: Graphs) -> Surrogate:
@@ -120,7 +117,7 @@ class Peer(nn.Module):
     def __init__(self, surrogate: Surrogate) -> None:
         super().__init__()
         self.surrogate = surrogate
-        self.levels: dict[int, Level] = surrogate.core.levels
+        self.levels: dict[int, LevelNetwork] = surrogate.core.levels
         self.convolutions = {
             k: [self._like(layer) for layer in level.reduction.decoder.convolutions.layers]
             for k, level in self.levels.items()

@@ -1,8 +1,8 @@
 """What a crash dataset is.
 
 Read `layout.py` to know every dimension, variable, unit and attribute; `validation.py` holds the rules a
-dataset must pass; `checksum.py` how its content is identified; `units.py` the unit systems crash solvers are run in.
-Nothing here reads or writes files.
+dataset must pass; `checksum.py` how its content is identified; `units.py` the unit systems crash solvers are run in;
+`levels.py` and `edges.py` the arrays of a coarse mesh, which all packages share. Nothing here reads or writes files.
 """
 
 from data_schema.checksum import dataset_checksum, digests_of_run, run_checksum

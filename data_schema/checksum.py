@@ -10,12 +10,15 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from data_schema.layout import VARIABLES, fields, parameters
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 # Results are stored and hashed in blocks of all states and some nodes (faces, cells), of about this many bytes.
 BLOCK_BYTES = 8 << 20

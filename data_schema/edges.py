@@ -33,3 +33,14 @@ def adjacency(n: int, edges: NDArray[np.integer]) -> sparse.csr_matrix:
     i, j = edges.T
     ones = np.ones(2 * len(edges))
     return sparse.csr_matrix((ones, (np.concatenate([i, j]), np.concatenate([j, i]))), shape=(n, n))
+
+
+def without_sides(edges: NDArray[np.integer], triangles: NDArray[np.integer]) -> NDArray[np.int64]:
+    """The edges (e, 2) that are no side of any of the triangles (m, 3): lone edges."""
+    pairs: NDArray[np.int64] = edges.astype(np.int64)
+    if len(triangles) == 0 or len(pairs) == 0:
+        return pairs
+    sides = unique_pairs(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)).astype(np.int64)
+    width = int(max(sides.max(), pairs.max())) + 1
+    low, high = pairs.min(axis=1), pairs.max(axis=1)
+    return pairs[~np.isin(low * width + high, sides[:, 0] * width + sides[:, 1])]

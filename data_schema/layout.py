@@ -11,10 +11,12 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-
-import xarray as xr
+from typing import TYPE_CHECKING
 
 from data_schema.units import to_si
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 CONVENTIONS = "CF-1.11 UGRID-1.0"
 

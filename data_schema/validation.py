@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from data_schema.checksum import (
@@ -19,6 +19,9 @@ from data_schema.checksum import (
     run_checksum,
 )
 from data_schema.layout import ATTRIBUTES, CONVENTIONS, VARIABLES, fields, parameters
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 # A displacement of the first state below this many metres is rounding of single precision positions.
 FIRST_STATE_TOLERANCE = 1e-5
@@ -261,7 +264,7 @@ def _dims(dims: tuple[str, ...] | tuple[object, ...]) -> str:
     return "(" + ", ".join(map(str, dims)) + ")"
 
 
-_Rule = Callable[[xr.Dataset], Iterator[Violation]]
+_Rule = Callable[["xr.Dataset"], Iterator[Violation]]
 _STRUCTURE: tuple[_Rule, ...] = (_variables, _sizes, _attributes, _roles)
 _VALUES: tuple[_Rule, ...] = (
     _time, _unique, _indices, _reference, _parameter_values, _completeness,

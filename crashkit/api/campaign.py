@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
-    from surrogates.data.campaign import Campaign, GraphLevel, Labels, Mirror
+    from surrogates.data.campaign import Campaign, Labels, Mirror
 
 
 class RunField:
@@ -46,7 +46,7 @@ def open_campaign(path: str | Path, test: Any = None, *, symmetry: bool = False)
 
     from crashkit.dataset import open_dataset
     from crashkit.errors import DataError
-    from crashkit.mesh.store import level_displacement
+    from crashkit.mesh.store import has_hierarchy, level_displacement, read_hierarchy
     from crashkit.selection import runs_of
     from data_schema import fields, parameters, table_unit
     from data_schema.dimensions import dimension
@@ -65,7 +65,7 @@ def open_campaign(path: str | Path, test: Any = None, *, symmetry: bool = False)
     if not names:
         raise DataError(f"{path}: no run has a parameter; give them with crashkit ingest --params")
     at = dataset["reference_position"]
-    coarse = _levels(path)
+    coarse = read_hierarchy(path).levels if has_hierarchy(path) else ()
 
     def displacement(level: int) -> Any:
         return RunField(path, chosen, states, nodes) if level == 0 else level_displacement(path, level, chosen)
@@ -119,12 +119,3 @@ def _mirrors(dataset: Any) -> tuple[Mirror, ...]:
     except MeshError:
         return ()
     return tuple(Mirror(plane.reflection, plane.to_image, plane.name, plane.told()) for plane in planes)
-
-
-def _levels(path: Path) -> tuple[GraphLevel, ...]:
-    """The hierarchy as the surrogates take it; empty where the dataset has none."""
-    from crashkit.mesh.store import has_hierarchy, read_hierarchy
-    from surrogates.data.campaign import GraphLevel
-
-    stored = read_hierarchy(path).levels if has_hierarchy(path) else ()
-    return tuple(GraphLevel(k.index, k.kept, k.faces, k.edges, k.in_finer, k.to_finer, k.to_full) for k in stored)

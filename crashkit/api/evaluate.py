@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
-    from evaluation.comparison.predictor import Mesh, Model
+    from data_schema.levels import Level
+    from evaluation.comparison.predictor import Model
     from evaluation.comparison.reference import Reference
     from evaluation.comparison.result import Evaluation
     from evaluation.comparison.scoring import RunScores
@@ -221,7 +222,7 @@ class StoredLevel:
     surrogate: Surrogate
     name: str
     level: int
-    mesh: Mesh | None
+    mesh: Level | None
     order: tuple[int, ...]
     n_parameters: int
     n_latent: int
@@ -286,7 +287,7 @@ def as_model(surrogate: Surrogate, folder: Path, reference: Reference) -> Model:
     )
 
 
-def _own_mesh(surrogate: Surrogate, folder: Path, name: str, level: int, reference: Reference) -> Mesh | None:
+def _own_mesh(surrogate: Surrogate, folder: Path, name: str, level: int, reference: Reference) -> Level | None:
     """The level's own mesh where training refined it; None where it is the dataset's."""
     import numpy as np
 

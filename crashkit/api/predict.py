@@ -180,8 +180,8 @@ def write_prediction(
     import numpy as np
 
     from crashkit.errors import DataError, OutputError
-    from crashkit.mesh.probe import without_sides
     from crashkit.writers.paraview import write_paraview
+    from data_schema.edges import without_sides
 
     further = further or {}
     level = int(run.attrs["level"])

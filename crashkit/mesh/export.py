@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from crashkit.mesh.levels import Hierarchy
-from crashkit.mesh.probe import without_sides
 from crashkit.writers.paraview import write_paraview
+from data_schema.edges import without_sides
 
 
 def write_levels(
@@ -55,7 +55,8 @@ def write_levels(
             if coarser > index:
                 points[f"level_{coarser}_nodes"] = nodes[kept]
                 points[f"level_{coarser}_weights"] = weights[kept]
-                points[f"level_{coarser}_distance"] = distance[kept]
+                if distance is not None:
+                    points[f"level_{coarser}_distance"] = distance[kept]
         lines = np.empty((0, 2), np.int64)
         cells: dict[str, Any] = {}
         faces: NDArray[np.integer] = face_nodes

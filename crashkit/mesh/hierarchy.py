@@ -11,11 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
 from crashkit.errors import MeshError
-from crashkit.mesh.levels import Hierarchy, Level
+from crashkit.mesh.levels import Hierarchy
 from crashkit.mesh.probe import coarse_cells, probe_map
 from crashkit.mesh.selection import Selection, select_quadric
 from crashkit.mesh.selection_vtk import select_vtk
 from crashkit.mesh.surface import Surface, surface
+from data_schema.levels import Level
 
 SelectionName = Literal["quadric", "vtk"]
 # A level of about 1/8 and two of 1/4, as in the paper.

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crashkit.mesh.levels import Hierarchy, Level
+from crashkit.mesh.levels import Hierarchy
 from crashkit.readers.base import split_states
+from data_schema.levels import Level
 
 # Bytes of displacement lifted at once.
 _BUDGET = 32 << 20

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial import cKDTree
 
-from data_schema.edges import adjacency, unique_pairs
+from data_schema.edges import adjacency, without_sides
 
 if TYPE_CHECKING:
     from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
@@ -178,14 +178,3 @@ def cells_of_nodes(nodes: NDArray[np.int64], k: int) -> tuple[NDArray[np.int64],
     node = nodes[valid]
     order = np.argsort(node, kind="stable")
     return np.concatenate([[0], np.cumsum(np.bincount(node, minlength=k))]), cell[order]
-
-
-def without_sides(edges: NDArray[np.integer], triangles: NDArray[np.integer]) -> NDArray[np.int64]:
-    """The edges (e, 2) that are no side of any of the triangles (m, 3): lone edges."""
-    pairs: NDArray[np.int64] = edges.astype(np.int64)
-    if len(triangles) == 0 or len(pairs) == 0:
-        return pairs
-    sides = unique_pairs(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)).astype(np.int64)
-    width = int(max(sides.max(), pairs.max())) + 1
-    low, high = pairs.min(axis=1), pairs.max(axis=1)
-    return pairs[~np.isin(low * width + high, sides[:, 0] * width + sides[:, 1])]

@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from crashkit.errors import MeshError
 from crashkit.mesh.hierarchy import assemble
-from crashkit.mesh.levels import Hierarchy, Level
+from crashkit.mesh.levels import Hierarchy
 from crashkit.mesh.selection import Selection, contract_onto, everything
 from crashkit.mesh.surface import Surface, part_sets
 from data_schema.edges import adjacency
+from data_schema.levels import Level
 
 
 def refine(

@@ -24,9 +24,10 @@ from scipy import sparse
 
 from crashkit.dataset import open_dataset, reading
 from crashkit.errors import DataError, OutputError, ReadError
-from crashkit.mesh.levels import Hierarchy, Level
+from crashkit.mesh.levels import Hierarchy
 from crashkit.mesh.lifting import LiftingError, LiftingMeter
 from crashkit.readers.base import split_states
+from data_schema.levels import Level
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -109,7 +110,7 @@ def read_hierarchy(path: str | Path) -> Hierarchy:
                     in_finer=group["in_finer"].values.astype(np.int64),
                     to_finer=_csr(group, "to_finer", n_finer, group.sizes["level_node"]),
                     to_full=_csr(group, "to_full", n_full, group.sizes["level_node"]),
-                    distance=group["distance"].values.astype(np.float64),
+                    distance=group["distance"].values.astype(np.float64) if "distance" in group else None,
                     face_part=group["face_part"].values.astype(np.int32) if "face_part" in group else None,
                 )
             except (KeyError, ValueError) as error:
@@ -152,7 +153,7 @@ def summarize_hierarchy(path: str | Path) -> list[dict[str, float | int]]:
     rows = []
     for index in range(1, int(_about(path)["levels"]) + 1):
         with _open_level(path, index) as group:
-            distance = group["distance"].values
+            distance = group["distance"].values if "distance" in group else np.array([np.nan])
             rows.append(
                 {
                     "level": index,
@@ -293,9 +294,9 @@ def _write_level(target: _Target, level: Level, error: LiftingError) -> None:
     target.array(
         group, "in_finer", ("level_node",), level.in_finer, {"long_name": "place among the nodes of the finer level"}
     )
-    target.array(
-        group, "distance", ("node",), level.distance, {"units": "m", "long_name": "distance to the coarse surface"}
-    )
+    if level.distance is not None:
+        about = {"units": "m", "long_name": "distance to the coarse surface"}
+        target.array(group, "distance", ("node",), level.distance, about)
     for name, matrix in (("adjacency", level.adjacency), ("to_finer", level.to_finer), ("to_full", level.to_full)):
         target.array(group, f"{name}_indptr", (f"{name}_row",), matrix.indptr.astype(np.int64), {})
         target.array(group, f"{name}_indices", (f"{name}_entry",), matrix.indices.astype(np.int32), {})

@@ -9,23 +9,8 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
-
-class Mesh(Protocol):
-    """The coarse mesh a predictor works on; the fields mean what `crashkit.mesh.levels.Level` says."""
-
-    @property
-    def kept(self) -> NDArray[np.int64]: ...
-
-    @property
-    def faces(self) -> NDArray[np.int32]: ...
-
-    @property
-    def edges(self) -> NDArray[np.int32]: ...
-
-    @property
-    def to_full(self) -> sparse.csr_matrix: ...
+from data_schema.levels import Level
 
 
 class Predictor(Protocol):
@@ -51,7 +36,7 @@ class Predictor(Protocol):
 
     name: str
     level: int
-    mesh: Mesh | None
+    mesh: Level | None
     n_parameters: int
     n_latent: int
     seconds_per_epoch: float

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from crashkit.mesh.levels import Level
+from data_schema.levels import Level
 from evaluation.errors import EvaluationError
 
 if TYPE_CHECKING:

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.comparison.predictor import NOMINAL, Banded, Mesh, Predictor
+from data_schema.levels import Level
+from evaluation.comparison.predictor import NOMINAL, Banded, Predictor
 from evaluation.comparison.reference import Reference
 from evaluation.comparison.sensors import Parted, Sensors, Watched, joined, part_error, watch
 from evaluation.errors import EvaluationError
@@ -264,7 +265,7 @@ def full_field(
     return np.asarray(field, dtype=np.float32) if mesh is None else lift(field, mesh.to_full)
 
 
-def mesh_of(reference: Reference, predictor: Predictor) -> Mesh | None:
+def mesh_of(reference: Reference, predictor: Predictor) -> Level | None:
     """The coarse mesh `predictor` works on: its own, or the dataset's level; None for the full mesh."""
     if predictor.level == 0:
         return None

@@ -26,7 +26,7 @@ def draw_levels(
     import numpy as np
     from matplotlib.figure import Figure
 
-    from crashkit.mesh.probe import without_sides
+    from data_schema.edges import without_sides
     from evaluation.drawing.rendering import choose_view, render
 
     with _output(picture):

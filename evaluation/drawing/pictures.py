@@ -64,7 +64,7 @@ class Row:
 class KeptNodes:
     """The nodes of one level on the full mesh: `kept` node numbers, `faces` (m, 3) and `edges` (e, 2) between them.
 
-    `faces` and `edges` are in the level's own numbering, as in `crashkit.mesh.levels.Level`.
+    `faces` and `edges` are in the level's own numbering, as in `data_schema.levels.Level`.
     """
 
     label: str

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from crashkit.mesh.levels import Level
+from data_schema.levels import Level
 from evaluation.drawing.style import CM, Sheet
 from evaluation.figures.kind import Columns, Kind
 
@@ -33,7 +33,9 @@ class Meshes:
             "level": [level.index for level in self.levels],
             "nodes": [level.n_nodes for level in self.levels],
             "faces": [len(level.faces) for level in self.levels],
-            "distance_to_surface_cm": [float(np.mean(level.distance)) * CM for level in self.levels],
+            "distance_to_surface_cm": [
+                np.nan if level.distance is None else float(np.mean(level.distance)) * CM for level in self.levels
+            ],
             "lifting_error_cm": [self.lifting[level.index] * CM for level in self.levels],
         }
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from crashkit.output import file_name
 from crashkit.writers.paraview import rounded, write_paraview
+from data_schema.edges import without_sides
 from evaluation.comparison.predictor import Model, Predictor, array_names
 from evaluation.comparison.reference import Reference
 from evaluation.comparison.result import Evaluation
@@ -171,7 +172,7 @@ def _write_coarse(
     return [
         write_paraview(
             path.parent / (path.name + suffix), reference.position_of(run)[level.kept], level.faces, reference.time,
-            data, lines=lone_edges(level.faces, level.edges), units=_units(data), field_data=about,
+            data, lines=without_sides(level.edges, level.faces), units=_units(data), field_data=about,
         )[0]
         for suffix in formats
     ]  # fmt: skip
@@ -203,14 +204,3 @@ def _small(numbers: NDArray[np.integer]) -> NDArray[np.integer]:
 
 def _units(data: Mapping[str, Any]) -> dict[str, str]:
     return {name: "m" for name in data if name.startswith(_METRES)}
-
-
-def lone_edges(faces: NDArray[np.integer], edges: NDArray[np.integer]) -> NDArray[np.int64]:
-    """(e, 2) those of `edges` that are no side of any of the triangles `faces` (m, 3)."""
-    sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    ends = np.sort(edges, axis=1)
-    width = int(max(sides.max(initial=0), ends.max(initial=0))) + 1
-    known = np.isin(
-        ends[:, 0].astype(np.int64) * width + ends[:, 1], sides[:, 0].astype(np.int64) * width + sides[:, 1]
-    )
-    return np.asarray(edges, np.int64)[~known].reshape(-1, 2)

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from data_schema.levels import Level
+
 
 class Field(Protocol):
     """Displacements (sim, state, node, 3) float32, m, of which one run at a time is taken; a numpy array is one."""
@@ -18,26 +20,6 @@ class Field(Protocol):
     def shape(self) -> tuple[int, ...]: ...
 
     def __getitem__(self, run: int, /) -> NDArray[np.float32]: ...
-
-
-@dataclass(frozen=True)
-class GraphLevel:
-    """One coarse level as arrays; the fields mean what `crashkit.mesh.levels.Level` says.
-
-    Level 0 is the full mesh, level 1 the finest coarse level, higher is coarser.
-    """
-
-    index: int
-    kept: NDArray[np.int64]
-    faces: NDArray[np.int32]
-    edges: NDArray[np.int32]
-    in_finer: NDArray[np.int64]
-    to_finer: sparse.csr_matrix
-    to_full: sparse.csr_matrix
-
-    @property
-    def n_nodes(self) -> int:
-        return len(self.kept)
 
 
 @dataclass(frozen=True)
@@ -98,7 +80,7 @@ class Campaign:
     time: NDArray[np.float64]
     displacement: Callable[[int], Field]
     n_nodes: int
-    levels: tuple[GraphLevel, ...] = ()
+    levels: tuple[Level, ...] = ()
     full_edges: NDArray[np.int32] | None = None
     runs: tuple[str, ...] = ()
     checksum: str = ""

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from surrogates.data.campaign import Campaign, GraphLevel
+from data_schema.levels import Level
+from surrogates.data.campaign import Campaign
 from surrogates.errors import SurrogateError
 
 
@@ -17,7 +18,7 @@ class Graphs:
     """Level 0 is the full mesh with `n_full` nodes; `levels` holds the coarser ones, level 1 first."""
 
     n_full: int
-    levels: tuple[GraphLevel, ...] = ()
+    levels: tuple[Level, ...] = ()
     full_edges: NDArray[np.int32] | None = None
 
     @classmethod
@@ -32,7 +33,7 @@ class Graphs:
                 )
         return graphs
 
-    def __getitem__(self, number: int) -> GraphLevel:
+    def __getitem__(self, number: int) -> Level:
         if not 1 <= number <= len(self.levels):
             has = f"levels 1 to {len(self.levels)}" if self.levels else "no coarse level"
             raise SurrogateError(f"level {number} was asked for; the mesh hierarchy has {has}")

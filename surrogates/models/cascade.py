@@ -12,7 +12,7 @@ from torch import Tensor
 from surrogates.data.graphs import Graphs
 from surrogates.data.inputs import InputScaling
 from surrogates.models.base import Network, in_metres
-from surrogates.models.level import Level
+from surrogates.models.level import LevelNetwork
 from surrogates.operators.upsampling import Upsampling
 from surrogates.reductions.reduction import make_reduction
 from surrogates.regression.network import Regressor
@@ -24,10 +24,10 @@ class Cascade(Network):
 
     def __init__(self, inputs: InputScaling) -> None:
         super().__init__(inputs)
-        self.levels: dict[int, Level] = {}
-        self.finest: Level | None = None
+        self.levels: dict[int, LevelNetwork] = {}
+        self.finest: LevelNetwork | None = None
 
-    def add(self, number: int, level: Level) -> None:
+    def add(self, number: int, level: LevelNetwork) -> None:
         """Put `level` on top; it was built on those that are here."""
         self.levels[number] = level
         self.finest = level
@@ -63,7 +63,7 @@ class Cascade(Network):
         return {f"level_{k}": v.own_state() for k, v in self.levels.items()}
 
 
-def build_level(number: int, settings: Settings, graphs: Graphs, cascade: Cascade) -> Level:
+def build_level(number: int, settings: Settings, graphs: Graphs, cascade: Cascade) -> LevelNetwork:
     """An untrained level `number` on top of what `cascade` holds; coarser levels are frozen by it."""
     own = settings.for_level(number)
     coarse_number = cascade.numbers[-1] if cascade.numbers else None
@@ -84,7 +84,7 @@ def build_level(number: int, settings: Settings, graphs: Graphs, cascade: Cascad
             "upsampling": Upsampling(graphs.upsampling(coarse_number, number), settings.transfer.upsampling),
             "in_finer": graphs.places(coarse_number, number),
         }
-    return Level(
+    return LevelNetwork(
         reduction, regressor, n_nodes=graphs.n_nodes(number), latent=latent, concat=concat,
         with_initial=settings.inputs.initial_state, **more,
     )  # fmt: skip

@@ -32,7 +32,7 @@ class Known:
     regressed: Tensor | None = None
 
 
-class Level(nn.Module):
+class LevelNetwork(nn.Module):
     """A level alone, or on top of the frozen `coarse` one:
 
         z     = enc_l(D x) + enc*(x)
@@ -62,7 +62,7 @@ class Level(nn.Module):
         n_nodes: int,
         latent: int,
         scale: float = 1.0,
-        coarse: Level | None = None,
+        coarse: LevelNetwork | None = None,
         upsampling: Upsampling | None = None,
         in_finer: NDArray[np.int64] | None = None,
         concat: bool = False,
@@ -80,7 +80,7 @@ class Level(nn.Module):
         self.with_initial = with_initial
         self.upsampling = upsampling
         self.process: LatentProcess | None = None
-        self.coarse: Level | None = coarse
+        self.coarse: LevelNetwork | None = coarse
         if coarse is not None and in_finer is not None:
             coarse.requires_grad_(False)
             self.register_buffer("in_finer", torch.from_numpy(np.asarray(in_finer, np.int64)), persistent=False)

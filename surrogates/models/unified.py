@@ -88,7 +88,7 @@ class Unified(Network):
         return out
 
     def regress(self, inputs: Tensor, initial: Tensor | None = None) -> Tensor:
-        """(b, inputs) -> z; `initial` (node, b or 1, 3) as in `Level.regress`."""
+        """(b, inputs) -> z; `initial` (node, b or 1, 3) as in `LevelNetwork.regress`."""
         if self.with_initial:
             first = self.encode(inputs.new_zeros(self.n_nodes, 1, 3) if initial is None else initial)
             inputs = torch.cat([inputs, first.expand(len(inputs), -1) if len(first) == 1 else first], dim=1)

@@ -16,6 +16,7 @@ from scipy import sparse
 from scipy.sparse.linalg import eigsh
 from torch import Tensor
 
+from data_schema.edges import adjacency, unique_pairs
 from surrogates.errors import SurrogateError
 
 Kind = Literal["cheb", "gcn", "gcn2"]
@@ -51,14 +52,14 @@ class GraphOperator:
         self.n_nodes = int(n_nodes)
         self.kind = kind
         self.form: Form = form
-        adjacency = _adjacency(np.asarray(edges), self.n_nodes)
+        neighbours = _checked_adjacency(np.asarray(edges), self.n_nodes)
         if kind == "cheb":
-            laplacian = normalised_laplacian(adjacency)
+            laplacian = normalised_laplacian(neighbours)
             self.lambda_max = largest_eigenvalue(laplacian)
             matrix = 2.0 / self.lambda_max * laplacian - sparse.identity(self.n_nodes)
         else:
             self.lambda_max = math.nan
-            matrix = _scaled_by_degree(adjacency + sparse.identity(self.n_nodes))
+            matrix = _scaled_by_degree(neighbours + sparse.identity(self.n_nodes))
         self.matrix: sparse.csr_matrix = sparse.csr_matrix(matrix)
         self.matrix.sort_indices()
         self._tensors: dict[tuple[torch.device, torch.dtype, int], Tensor] = {}
@@ -138,9 +139,9 @@ def _sparse_product(matrix: Tensor, x: Tensor, out: Tensor, add: bool) -> None:
         torch.mm(matrix, x, out=out)
 
 
-def normalised_laplacian(adjacency: sparse.spmatrix) -> sparse.csr_matrix:
+def normalised_laplacian(neighbours: sparse.spmatrix) -> sparse.csr_matrix:
     """L = I - D^-1/2 A D^-1/2 (n, n) of a symmetric 0/1 adjacency (n, n); D^-1/2 is 0 where a node has no edge."""
-    return sparse.csr_matrix(sparse.identity(adjacency.shape[0]) - _scaled_by_degree(adjacency))
+    return sparse.csr_matrix(sparse.identity(neighbours.shape[0]) - _scaled_by_degree(neighbours))
 
 
 def largest_eigenvalue(laplacian: sparse.spmatrix) -> float:
@@ -152,7 +153,7 @@ def largest_eigenvalue(laplacian: sparse.spmatrix) -> float:
     return float(eigsh(laplacian, k=1, which="LA", v0=start, return_eigenvectors=False)[0])
 
 
-def _adjacency(edges: NDArray[Any], n_nodes: int) -> sparse.csr_matrix:
+def _checked_adjacency(edges: NDArray[Any], n_nodes: int) -> sparse.csr_matrix:
     """Symmetric 0/1 adjacency (n, n) without loops."""
     if n_nodes < 1:
         raise SurrogateError(f"a graph of {n_nodes} nodes was asked for; it needs at least one")
@@ -162,16 +163,14 @@ def _adjacency(edges: NDArray[Any], n_nodes: int) -> sparse.csr_matrix:
     edges = edges.astype(np.int64)
     if edges.size and (edges.min() < 0 or edges.max() >= n_nodes):
         raise SurrogateError(f"edges name the nodes {edges.min()} to {edges.max()}; the graph has 0 to {n_nodes - 1}")
-    i, j = edges[edges[:, 0] != edges[:, 1]].T
-    one = sparse.csr_matrix((np.ones(len(i)), (i, j)), shape=(n_nodes, n_nodes))
-    return sparse.csr_matrix(((one + one.T) > 0).astype(np.float64))
+    return adjacency(n_nodes, unique_pairs(edges))
 
 
-def _scaled_by_degree(adjacency: sparse.spmatrix) -> sparse.csr_matrix:
+def _scaled_by_degree(neighbours: sparse.spmatrix) -> sparse.csr_matrix:
     """D^-1/2 A D^-1/2 with D the row sums of A."""
-    degree = np.asarray(adjacency.sum(axis=1)).ravel()
+    degree = np.asarray(neighbours.sum(axis=1)).ravel()
     root = np.divide(1.0, np.sqrt(degree), out=np.zeros_like(degree), where=degree > 0)
-    return sparse.csr_matrix(sparse.diags(root) @ adjacency @ sparse.diags(root))
+    return sparse.csr_matrix(sparse.diags(root) @ neighbours @ sparse.diags(root))
 
 
 class _Propagate(torch.autograd.Function):

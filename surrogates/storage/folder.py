@@ -30,7 +30,8 @@ from safetensors.torch import load_file, save_file
 from scipy import sparse
 from torch import Tensor
 
-from surrogates.data.campaign import GraphLevel, Labels
+from data_schema.levels import Level
+from surrogates.data.campaign import Labels
 from surrogates.data.graphs import Graphs
 from surrogates.data.inputs import InputScaling
 from surrogates.errors import ModelFolderError, SurrogateError
@@ -208,7 +209,7 @@ def _graph_tensors(surrogate: Surrogate) -> dict[str, Tensor]:
 def _graphs(tensors: Mapping[str, Tensor]) -> tuple[Graphs, NDArray[np.float64] | None, NDArray[np.int32] | None]:
     a = {k: v.numpy() for k, v in tensors.items()}
     n_full = int(a["nodes"][0])
-    levels: list[GraphLevel] = []
+    levels: list[Level] = []
     finer = n_full
     while f"level_{len(levels) + 1}.kept" in a:
         prefix = f"level_{len(levels) + 1}."
@@ -219,7 +220,7 @@ def _graphs(tensors: Mapping[str, Tensor]) -> tuple[Graphs, NDArray[np.float64] 
             return sparse.csr_matrix(parts, shape=(rows, columns))
 
         levels.append(
-            GraphLevel(
+            Level(
                 len(levels) + 1, kept, a[prefix + "faces"], a[prefix + "edges"], a[prefix + "in_finer"],
                 csr("to_finer", finer, len(kept)), csr("to_full", n_full, len(kept)),
             )

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from surrogates.errors import SurrogateError
-from surrogates.models.level import Known, Level
+from surrogates.models.level import Known, LevelNetwork
 from surrogates.models.unified import Unified
 from surrogates.reductions.reduction import linear_part
 from surrogates.training.loop import Objective
@@ -63,7 +63,7 @@ def as_states(rows: Tensor) -> Tensor:
 class LevelObjective(Objective):
     """mean((x - dec(mlp))^2) and mean((x - dec(enc(x)))^2) of one level; both decoded in one pass (equation 8)."""
 
-    def __init__(self, level: Level, training: Samples, validation: Samples | None) -> None:
+    def __init__(self, level: LevelNetwork, training: Samples, validation: Samples | None) -> None:
         super().__init__()
         self.level = level
         self.training_samples, self.validation_samples = training, validation
@@ -109,7 +109,7 @@ class LatentObjective(Objective):
     """
 
     def __init__(
-        self, level: Level, training: Samples, validation: Samples, rest: Tensor, validation_rest: Tensor
+        self, level: LevelNetwork, training: Samples, validation: Samples, rest: Tensor, validation_rest: Tensor
     ) -> None:
         super().__init__()
         self.level = level

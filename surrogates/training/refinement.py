@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from surrogates.data.campaign import GraphLevel
+from data_schema.edges import adjacency
+from data_schema.levels import Level
 from surrogates.data.graphs import Graphs
 from surrogates.errors import SurrogateError
 
@@ -54,7 +55,7 @@ class Refined:
         interpolated = sparse.csr_matrix(self.hierarchy[self.number].to_finer @ self.spread)
         spread = _keeping(interpolated, here, chosen, place)
         coarse = replace(self.graphs[self.number], in_finer=place[here], to_finer=interpolated[chosen])
-        finer = GraphLevel(
+        finer = Level(
             index=fine.index,
             kept=fine.kept[chosen],
             faces=_joined(place[fine.faces], place[here][coarse.faces], place[here[worst]]),
@@ -71,9 +72,7 @@ class Refined:
 
 def _around(edges: NDArray[np.int32], n_nodes: int, nodes: NDArray[np.int64], rings: int) -> NDArray[np.int64]:
     """`nodes` and all within `rings` edges of them."""
-    i, j = edges.T
-    ones = sparse.csr_matrix((np.ones(len(i)), (i, j)), shape=(n_nodes, n_nodes))
-    step = ones + ones.T
+    step = adjacency(n_nodes, edges)
     reached = np.zeros(n_nodes)
     reached[nodes] = 1.0
     for _ in range(rings):

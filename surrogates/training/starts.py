@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surrogates.models.level import Level
+from surrogates.models.level import LevelNetwork
 from surrogates.models.unified import Unified
 from surrogates.reductions.pod import pod
 from surrogates.reductions.reduction import LinearReduction, LinearStart, flat
@@ -49,7 +49,7 @@ def pod_start(batches: Iterator[Tensor], count: int, n_nodes: int) -> LinearStar
 
 
 @torch.no_grad()
-def start_level(level: Level, linear: LinearReduction, batches: Batches) -> None:
+def start_level(level: LevelNetwork, linear: LinearReduction, batches: Batches) -> None:
     """Compute the linear part `linear` of an untrained `level`."""
     own = linear.encode_matrix.shape[1]
     if level.coarse is None:
@@ -104,12 +104,12 @@ def _regress(linear: LinearReduction, pairs: Iterable[tuple[Tensor, Tensor]]) ->
     linear.offset.copy_(solved[-1])
 
 
-def _interpolated(level: Level, x: Tensor) -> Tensor:
+def _interpolated(level: LevelNetwork, x: Tensor) -> Tensor:
     """U D x: what interpolation between the coarse nodes already gives."""
     return level.upsampling(x[level.in_finer])  # type: ignore[misc]
 
 
-def _back(level: Level, matrix: Tensor) -> Tensor:
+def _back(level: LevelNetwork, matrix: Tensor) -> Tensor:
     """(U D)^T times the columns of `matrix` (3 * node, r): encode^T (x - U D x) = (encode - back)^T x."""
     up = level.upsampling.as_matrix()  # type: ignore[union-attr]
     fields = matrix.reshape(level.n_nodes, -1)

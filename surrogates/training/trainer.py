@@ -15,7 +15,7 @@ from surrogates.data.graphs import Graphs
 from surrogates.data.inputs import InputScaling
 from surrogates.data.samples import Notes, Runs, Split, scale_of
 from surrogates.models.cascade import Cascade, build_level
-from surrogates.models.level import Level
+from surrogates.models.level import LevelNetwork
 from surrogates.models.unified import Unified
 from surrogates.record import Fit
 from surrogates.reductions.reduction import LinearReduction, LinearStart, linear_part
@@ -96,7 +96,7 @@ class Trainer:
             report=self.report, keeper=self.keeper,
         )  # fmt: skip
 
-    def _on_states(self, level: Level, runs: Runs, inputs: Tensor, held_inputs: Tensor) -> LevelObjective:
+    def _on_states(self, level: LevelNetwork, runs: Runs, inputs: Tensor, held_inputs: Tensor) -> LevelObjective:
         states, held = (runs.samples(part) for part in self._parts)
         level.scale = _divide_by_rms(states, held)
         linear = linear_part(level.reduction)
@@ -107,7 +107,7 @@ class Trainer:
         validation = self._samples(level, held, held_inputs, len(self.split.validation)) if len(held) else None
         return LevelObjective(level, training, validation)
 
-    def _on_coefficients(self, level: Level, runs: Runs, inputs: Tensor, held_inputs: Tensor) -> LatentObjective:
+    def _on_coefficients(self, level: LevelNetwork, runs: Runs, inputs: Tensor, held_inputs: Tensor) -> LatentObjective:
         """POD on fields that stay where they are but for one run; training then sees coefficients alone."""
         squares: list[float] = []
 
@@ -131,7 +131,7 @@ class Trainer:
         return objective
 
     @torch.no_grad()
-    def _samples(self, level: Level, states: Tensor, inputs: Tensor, runs: int) -> Samples:
+    def _samples(self, level: LevelNetwork, states: Tensor, inputs: Tensor, runs: int) -> Samples:
         """Samples on the device, with what the frozen levels say of them."""
         out = Samples(states.to(self.device), inputs)
         if level.with_initial:
@@ -154,7 +154,7 @@ class Trainer:
         return replace(samples, initial=first[:1] if alike else first, run=run)
 
     @torch.no_grad()
-    def _projected(self, level: Level, runs: Runs, chosen: NDArray[np.int64]) -> tuple[Tensor, Tensor]:
+    def _projected(self, level: LevelNetwork, runs: Runs, chosen: NDArray[np.int64]) -> tuple[Tensor, Tensor]:
         """Latent vectors (sample, 1, latent) and mean squares (sample,) that the modes leave, in the level's unit."""
         z, rest = [torch.empty(0, level.latent)], [torch.empty(0)]
         for run in chosen:

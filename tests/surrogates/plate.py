@@ -7,7 +7,8 @@ from itertools import pairwise
 import numpy as np
 from scipy import sparse
 
-from surrogates.data.campaign import Campaign, GraphLevel
+from data_schema.levels import Level
+from surrogates.data.campaign import Campaign
 
 SIDES = (9, 5, 3)
 TIME = np.linspace(0.0, 0.03, 7)
@@ -46,7 +47,7 @@ def edges(side: int) -> np.ndarray:
     return np.concatenate([np.stack([a.ravel(), b.ravel()], axis=1) for a, b in along]).astype(np.int32)
 
 
-def levels() -> tuple[GraphLevel, ...]:
+def levels() -> tuple[Level, ...]:
     """Every second point in both directions, and bilinear interpolation back."""
     out = []
     to_full = sparse.identity(SIDES[0] ** 2, format="csr")
@@ -62,7 +63,7 @@ def levels() -> tuple[GraphLevel, ...]:
         kept, to_full = kept[places], sparse.csr_matrix(to_full @ up)
         q = quads(coarse)
         triangles = np.concatenate([q[:, [0, 1, 2]], q[:, [0, 2, 3]]]).astype(np.int32)
-        out.append(GraphLevel(index, kept, triangles, edges(coarse), places, up, to_full))
+        out.append(Level(index, kept, triangles, edges(coarse), places, up, to_full))
     return tuple(out)
 
 

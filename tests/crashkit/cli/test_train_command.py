@@ -18,9 +18,10 @@ import crashkit
 from crashkit.api.predict import predict
 from crashkit.cli import app
 from crashkit.errors import DataError
-from crashkit.mesh.levels import Hierarchy, Level
+from crashkit.mesh.levels import Hierarchy
 from crashkit.mesh.store import write_hierarchy
 from crashkit.writers.paraview import read_state
+from data_schema.levels import Level
 from surrogates.settings import settings
 from surrogates.storage.folder import load
 from surrogates.surrogate import Surrogate

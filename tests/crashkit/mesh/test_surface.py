@@ -8,7 +8,6 @@ from mesh_shapes import plate
 
 from crashkit.errors import MeshError
 from crashkit.mesh.surface import surface
-from data_schema.edges import face_edges
 
 
 def test_quadrilaterals_are_cut_along_their_shorter_diagonal() -> None:
@@ -20,10 +19,6 @@ def test_quadrilaterals_are_cut_along_their_shorter_diagonal() -> None:
 def test_edges_are_the_sides_of_the_faces_and_not_the_diagonals() -> None:
     position, faces = plate(2, 2, quads=True)
     assert surface(position, faces).edges.tolist() == [[0, 1], [0, 2], [1, 3], [2, 3]]
-
-
-def test_a_triangle_among_quadrilaterals_has_three_sides() -> None:
-    assert face_edges([[0, 1, 2, -1], [2, 1, 3, 4]]).tolist() == [[0, 1], [0, 2], [1, 2], [1, 3], [2, 4], [3, 4]]
 
 
 @pytest.mark.parametrize("corners", [[0, 1, 2, 2], [0, 0, 1, 2], [0, 1, 1, 2], [0, 1, 2, 0]])

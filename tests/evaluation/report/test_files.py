@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import pyvista as pv
 
-from evaluation.report.files import coarsest_level, default_runs, lone_edges, write_run
+from data_schema.edges import without_sides
+from evaluation.report.files import coarsest_level, default_runs, write_run
 
 # The toy structure is 1 m long: predictions are rounded to less than 2e-5 of it.
 ROUNDED = 2e-5
@@ -72,16 +73,9 @@ def test_the_coarse_mesh_stands_alone(written, reference, models):
     level = reference.level(2)
     np.testing.assert_allclose(mesh.points, reference.position[level.kept], atol=1e-6)
     np.testing.assert_array_equal(mesh["node_id"], reference.node_id[level.kept])
-    assert mesh.n_cells == len(level.faces) + len(lone_edges(level.faces, level.edges))
+    assert mesh.n_cells == len(level.faces) + len(without_sides(level.edges, level.faces))
     expected = models[0].predictors[1].predict(reference.parameters[9], reference.time)[-1]
     np.testing.assert_allclose(mesh["predicted"], expected, atol=ROUNDED)
-
-
-def test_lone_edges_are_those_of_no_face():
-    faces = np.array([[0, 1, 2]])
-    edges = np.array([[0, 1], [1, 2], [0, 2], [2, 3], [3, 4]])
-    assert lone_edges(faces, edges).tolist() == [[2, 3], [3, 4]]
-    assert lone_edges(faces, edges[:3]).shape == (0, 2)
 
 
 def test_levels_are_nested_in_the_marked_nodes(reference):

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy import sparse
 
-from surrogates.data.campaign import GraphLevel
+from data_schema.levels import Level
 from surrogates.data.graphs import Graphs
 from surrogates.data.inputs import InputScaling, Ranges
 from surrogates.errors import SurrogateError
@@ -27,9 +27,7 @@ def chain(nodes: tuple[int, ...], full: int) -> Graphs:
     for index, n in enumerate(nodes, 1):
         up = sparse.csr_matrix((np.ones(finer), (np.arange(finer), np.minimum(np.arange(finer), n - 1))), (finer, n))
         kept = np.arange(n)
-        levels.append(
-            GraphLevel(index, kept, np.empty((0, 3), np.int32), star(n), kept, up, sparse.csr_matrix((full, n)))
-        )
+        levels.append(Level(index, kept, np.empty((0, 3), np.int32), star(n), kept, up, sparse.csr_matrix((full, n))))
         finer = n
     return Graphs(full, tuple(levels), star(full))
 
