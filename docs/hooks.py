@@ -13,11 +13,19 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     """Replace `<!-- schema: dimensions|variables|attributes -->`, `<!-- table: FILE -->` and `<!-- project: FILE -->`."""
     markdown = re.sub(r"<!-- project: (\S+) -->", lambda found: _project_file(found[1]), markdown)
     markdown = re.sub(r"<!-- table: (\S+) -->", lambda found: (HERE / found[1]).read_text(encoding="utf-8"), markdown)
+    if "<!-- gallery -->" in markdown:
+        markdown = markdown.replace("<!-- gallery -->", _gallery())
     for name, make in (("dimensions", _dimensions), ("variables", _variables), ("attributes", _attributes)):
         marker = f"<!-- schema: {name} -->"
         if marker in markdown:
             markdown = markdown.replace(marker, make())
     return markdown
+
+
+def _gallery() -> str:
+    import runpy
+
+    return str(runpy.run_path(str(HERE / "make_gallery.py"))["page"]())
 
 
 def _project_file(name: str) -> str:

@@ -1,0 +1,14 @@
+"""Where the runs lie in the space of the design parameters, and which of them are held out for testing."""
+
+import matplotlib.pyplot as plt
+
+import crashkit
+
+runs = crashkit.open_dataset("kart.zarr")
+for part, label in zip(runs.crash.split(test="27:36"), ("training", "test"), strict=True):
+    size = part.yield_stress / 1e6 / 5  # the third parameter, as the size of the dot
+    plt.scatter(part.impact_speed, part.impact_angle, s=size, alpha=0.6, label=label)
+plt.xlabel("impact speed (m/s)")
+plt.ylabel("impact angle (degree)")
+plt.legend(title="size: yield stress")
+plt.savefig("design_space.png", dpi=120)

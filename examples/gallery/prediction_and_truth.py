@@ -1,0 +1,18 @@
+"""A test run at its end: the simulation in grey, the prediction coloured by its error."""
+
+import numpy as np
+import pyvista as pv
+
+import crashkit
+
+runs = crashkit.open_dataset("kart.zarr")
+run = runs.sel(sim="run_031")
+predicted = crashkit.predict("mh", {name: float(run[name]) for name in runs.crash.parameters}, full=True)
+truth, mesh = run.crash.to_pyvista(), run.crash.surface()
+mesh.points += predicted.values[-1]
+mesh["error (cm)"] = 100 * np.linalg.norm(mesh.points - truth.points, axis=1)
+plot = pv.Plotter(off_screen=True, window_size=(900, 600))
+plot.add_mesh(truth, color="lightgrey")
+plot.add_mesh(mesh, scalars="error (cm)", cmap="inferno_r")
+plot.camera.zoom(1.4)
+plot.screenshot("prediction_and_truth.png")
