@@ -5,9 +5,9 @@ A mutant is the file with one small change (`+` for `-`, `<=` for `<`, an argume
 random sample of them is tried, each against the tests nearest to the file; one that all tests pass is a survivor, and
 its change is shown. The working tree is copied first, so nothing in it changes.
 
-Nearest are the test files that import from the mutated module, or else those of its folder under `tests/`; `--tests`
-names others. Left out of the sample are changes that only touch the words of a message (text with a space in it) and
-`strict=` of zip, which guards and does nothing else.
+Nearest are the test files called after the module, in the folder of `tests/` that mirrors its own; without any, those that
+import from the module; without any, the folder. `--tests` names others. Left out of the sample are changes that only touch
+the words of a message (text with a space in it) and `strict=` of zip, which guards and does nothing else.
 
 Ends with exit code 1 where less than `--share` of a file's sample was killed.
 """
@@ -80,17 +80,18 @@ def main() -> int:
 
 
 def nearest_tests(file: str) -> list[str]:
-    """Test files that import from the module, or the folder under `tests/` that mirrors its own."""
+    """Test files called after the module, or else those that import from it, or else the folder that mirrors its own."""
     module = file.removesuffix(".py").replace("/", ".")
     room, _, stem = module.rpartition(".")
+    folder = ROOT / "tests" / Path(file).parent
+    named = {*folder.glob(f"test_{stem}.py"), *folder.glob(f"test_{stem}_*.py"), *folder.glob(f"test_*_{stem}.py")}
     imports = re.compile(
         rf"^\s*(from {re.escape(module)} import|import {re.escape(module)}\b"
         rf"|from {re.escape(room)} import ([\w, ]+, )?{stem}\b)", re.MULTILINE
     )  # fmt: skip
-    tests = sorted((ROOT / "tests").rglob("test_*.py"))
-    found = [t.relative_to(ROOT).as_posix() for t in tests if imports.search(t.read_text(encoding="utf-8"))]
-    folder = Path("tests") / Path(file).parent
-    return found or [folder.as_posix() if (ROOT / folder).is_dir() else "tests"]
+    tests = (ROOT / "tests").rglob("test_*.py")
+    found = named or {t for t in tests if imports.search(t.read_text(encoding="utf-8"))} or {folder}
+    return sorted(t.relative_to(ROOT).as_posix() for t in found)
 
 
 def try_mutants(file: str, tests: list[str], sample: int, seed: int, jobs: int) -> Outcome:

@@ -106,16 +106,6 @@ def test_the_quadric_selection_lifts_better_than_the_one_through_vtk() -> None:
     assert (np.array(errors[0]) < errors[1]).all()
 
 
-def test_nodes_that_are_gone_are_left_out_of_the_lifting_error() -> None:
-    position, faces = plate(6, 6)
-    hierarchy = build_hierarchy(position, faces, [12])
-    u = np.zeros((2, 36, 3), np.float32)
-    u[1, hierarchy[1].kept[0]] = np.nan
-    meter = LiftingMeter(hierarchy)
-    meter.add(u)
-    assert meter.errors[0].mean == 0.0
-
-
 def test_lifting_keeps_the_precision_of_the_data() -> None:
     position, faces = plate(6, 6)
     level = build_hierarchy(position, faces, [12])[1]
