@@ -13,6 +13,7 @@ MODULES = {
     "report": ("matplotlib", "jinja2", "objective_rating_metrics"),
     "formats": ("meshio", "openpyxl"),
     "viewer": ("trame_vtk",),
+    "campaign": ("jinja2", "psutil", "submitit"),
     "distributed": ("dask", "distributed"),
     "tracking": ("tensorboard",),
     "export": ("onnx", "onnxscript", "onnxruntime"),

@@ -52,6 +52,8 @@ class Record:
     errors      e2 (m) by what was measured, on validation runs, on the level's own nodes
     choice      what a POD regression chose by cross-validation: inputs and modes
     physics     inputs, clock and symmetry in words, and "errors": e2 (m) by what each was worth in cross-validation
+    left_out    run -> e2 (m) when it is left out of the training, and the deviation the process then believes in, up to
+                a factor; of processes alone
     notes       what was unusual about the data
     """
 
@@ -69,6 +71,7 @@ class Record:
     errors: dict[str, float] = field(default_factory=dict)
     choice: dict[str, Any] = field(default_factory=dict)
     physics: dict[str, Any] = field(default_factory=dict)
+    left_out: dict[str, tuple[float, float]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     @classmethod
@@ -129,6 +132,7 @@ def record_from_dict(values: Mapping[str, Any], histories: Mapping[int, dict[str
         errors=dict(values["errors"]),
         choice=dict(values["choice"]),
         physics=dict(values["physics"]),
+        left_out={str(k): (float(e), float(d)) for k, (e, d) in values.get("left_out", {}).items()},
         notes=list(values["notes"]),
     )  # fmt: skip
 

@@ -203,7 +203,8 @@ class Settings(_Frozen):
     at         settings of single levels by their number, over those of `level`
     unified    one latent vector for all levels, trained together (section 3.5)
     precision  tf32 and bfloat16 (dense layers only) speed up a GPU
-    missing    values of eroded nodes: refuse, or hold each node's last displacement
+    missing    displacements of nodes that are gone: auto (hold each node's last one where elements erode, refuse elsewhere),
+               hold or refuse
     """
 
     model: Model = "mh"
@@ -220,7 +221,7 @@ class Settings(_Frozen):
     unified: bool = False
     pod: PodSettings = PodSettings()
     precision: Literal["float32", "tf32", "bfloat16"] = "float32"
-    missing: Literal["refuse", "hold"] = "refuse"
+    missing: Literal["auto", "hold", "refuse"] = "auto"
 
     @model_validator(mode="after")
     def _fits_together(self) -> Settings:

@@ -54,7 +54,9 @@ def open_campaign(path: str | Path, test: Any = None, *, symmetry: bool = False)
 
     path = Path(path)
     with open_dataset(path) as opened:
-        dataset = opened.drop_vars("displacement").drop_vars(fields(opened)).load()
+        erodes = "alive" in opened or "cell_alive" in opened
+        unread = [n for n in ("displacement", "alive", "cell_alive", "history") if n in opened]
+        dataset = opened.drop_vars([*unread, *fields(opened)]).load()
         states, nodes = opened.sizes["time"], opened.sizes["node"]
     runs = [str(n) for n in dataset["sim"].values]
     held_out = [] if test is None else runs_of(runs, test)
@@ -85,6 +87,7 @@ def open_campaign(path: str | Path, test: Any = None, *, symmetry: bool = False)
         checksum=str(dataset.attrs.get("checksum", "")),
         attributes={"dataset": path.name, "solver": str(dataset.attrs.get("solver", ""))},
         held_out=tuple(runs[k] for k in held_out),
+        erodes=erodes,
         points=np.asarray((at.isel(sim=0) if "sim" in at.dims else at).values, np.float64),
         faces=dataset["face_nodes"].values.astype(np.int32),
         labels=labels_of(dataset),

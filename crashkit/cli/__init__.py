@@ -17,7 +17,19 @@ import typer
 from crashkit.cli._console import fail
 
 # The order of a first day's work; `crashkit --help` lists them so.
-COMMANDS = ("demo", "ingest", "info", "validate", "coarsen", "train", "evaluate", "predict", "export")
+COMMANDS = (
+    "demo",
+    "ingest",
+    "info",
+    "validate",
+    "coarsen",
+    "train",
+    "evaluate",
+    "predict",
+    "propose",
+    "campaign",
+    "export",
+)
 
 app = typer.Typer(
     name="crashkit",

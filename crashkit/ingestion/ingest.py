@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,9 @@ from crashkit.ingestion.survey import Choice, Found, Survey, described, reader_o
 from crashkit.ingestion.transfer import Layout, is_whole, let_memory_go, transfer
 from crashkit.parallel import as_finished
 from crashkit.version import __version__
+
+if TYPE_CHECKING:
+    from crashkit.mesh.levels import Hierarchy
 
 Progress = Callable[[int, int, str], None]
 
@@ -99,8 +102,8 @@ def ingest(
                       workers see the same files
     progress          called with (runs done, runs in all or 0, note)
 
-    An existing dataset gets new runs appended at its own times, and loses its mesh hierarchy, which belongs to the
-    runs it was made with. Interrupted, the same call goes on where it was.
+    An existing dataset gets new runs appended at its own times; its mesh hierarchy goes on with them, since it depends
+    on the mesh alone. Interrupted, the same call goes on where it was.
 
     Raises CrashkitError (ReadError, DataError, OutputError) with file and place.
     """
@@ -169,11 +172,10 @@ class _Job:
             if not fresh:
                 raise DataError(f"no run can be used ({look.reasons()})")
             self.tell(len(fresh), len(fresh), "putting the dataset together")
+            hierarchy = _hierarchy_of(former)
             names = publish(staging, layout, fresh, staged, old, hashes)
-        if former is not None and former.has_hierarchy:
-            look.note(
-                "the mesh hierarchy was that of the former runs and is gone; make a new one with crashkit coarsen"
-            )
+        if hierarchy is not None:
+            look.note(_carried(staging.output, hierarchy))
         before = set(former.names) if former else set()
         summary = IngestSummary(
             output=staging.output,
@@ -387,6 +389,29 @@ def _note_lost_end(time: NDArray[np.float64], runs: Sequence[Found], look: Surve
 
 def _hash(values: NDArray[Any]) -> str:
     return hashlib.sha256(np.ascontiguousarray(values).tobytes()).hexdigest()
+
+
+def _hierarchy_of(former: Existing | None) -> Hierarchy | None:
+    """The mesh hierarchy of the dataset that is replaced, None where it has none."""
+    if former is None or not former.has_hierarchy:
+        return None
+    from crashkit.mesh.store import read_hierarchy
+
+    return read_hierarchy(former.path)
+
+
+def _carried(output: Path, hierarchy: Hierarchy) -> str:
+    """Give the new dataset the hierarchy of the former one, with the displacements of all its runs; what is told of it.
+
+    The selection depends on the mesh alone, which new runs share; where they replaced it, the hierarchy is gone.
+    """
+    from crashkit.mesh.store import write_hierarchy
+
+    try:
+        write_hierarchy(output, hierarchy)
+    except DataError:
+        return "the mesh hierarchy was that of another mesh and is gone; make a new one with crashkit coarsen"
+    return f"the mesh hierarchy ({', '.join(str(k.n_nodes) for k in hierarchy.levels)} nodes) goes on with the new runs"
 
 
 def _nothing_new(output: Path, old: Existing | None, unchanged: list[str], look: Survey) -> IngestSummary:

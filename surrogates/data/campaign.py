@@ -71,6 +71,7 @@ class Campaign:
     table_units     for each parameter the unit people write it in, and its value in `parameter_units`: ("MPa", 1e6)
     dimensions      exponents of (kg, m, s) of each parameter's unit, None where it has none that is known
     mirrors         planes of symmetry of the structure, the best first
+    erodes          whether elements disappear, so that displacements of nodes that nothing holds are missing
     known           (sim, state) whether a run was computed that far; None: all were. Other states are in no loss
     """
 
@@ -93,3 +94,4 @@ class Campaign:
     dimensions: tuple[tuple[float, float, float] | None, ...] = ()
     mirrors: tuple[Mirror, ...] = ()
     known: NDArray[np.bool_] | None = None
+    erodes: bool = False

@@ -122,7 +122,7 @@ class Runs:
     def read(self, run: int) -> NDArray[np.float32]:
         """(state, node, 3), m, without missing values.
 
-        Raises SurrogateError naming run, state and node of a missing value, unless `settings.missing` holds it.
+        Raises SurrogateError naming run, state and node of a missing value, unless it is held (`settings.missing`).
         """
         values = np.asarray(self._field[int(run)], np.float32)
         if self._chosen is not None:
@@ -142,7 +142,9 @@ class Runs:
     def _held(self, values: NDArray[np.float32], bad: NDArray[np.bool_], run: int) -> NDArray[np.float32]:
         state, node = np.argwhere(bad)[0]
         where = f"run {self._name(run)}, state {state}, node {node}"
-        if self._settings.missing == "refuse" or np.isinf(values).any():
+        missing = self._settings.missing
+        refused = missing == "refuse" or (missing == "auto" and not self._campaign.erodes)
+        if refused or np.isinf(values).any():
             raise SurrogateError(
                 f"{where}: the displacement is {values[state, node].tolist()}; expected numbers. "
                 "Where elements erode, the setting missing=hold keeps a node's last displacement"

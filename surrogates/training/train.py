@@ -91,7 +91,10 @@ def _fit_regression(surrogate: Surrogate, trainer: Trainer) -> None:
     record.choice = {"inputs": found.choice.inputs, "modes": found.choice.modes}
     record.physics = {**found.registration.told(), "errors": found.worth.errors}
     field = trainer.runs(0, surrogate.graphs)
-    distances = [_distance(held.predicted, field.read(runs[held.run])) for held in found.held()]
+    distances = []
+    for held in found.held():
+        distances.append(_distance(held.predicted, field.read(runs[held.run])))
+        record.left_out[record.fitted_runs[held.run]] = (float(distances[-1].mean()), held.deviation)
     _note(surrogate, next(iter(surrogate.level_names)), 0, distances, [])
     record.errors |= found.choice.errors
     record.fits[0] = Fit(seconds=time.perf_counter() - started)

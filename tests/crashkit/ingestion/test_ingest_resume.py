@@ -268,17 +268,21 @@ class TestSecondIngest:
         self.ingest(tmp_path, suffix, sources[0], overwrite=True, time=[0, 0.01, 0.02])
         assert open_dataset(tmp_path / f"crash{suffix}").sizes["time"] == 3
 
-    def test_hierarchy_of_the_old_runs_goes_and_it_is_said(self, tmp_path: Path, sources, suffix: str) -> None:  # type: ignore[no-untyped-def]
+    def test_the_hierarchy_goes_on_with_the_new_runs(self, tmp_path: Path, sources, suffix: str) -> None:  # type: ignore[no-untyped-def]
         from crashkit.api.coarsen import coarsen
-        from crashkit.mesh.store import has_hierarchy
+        from crashkit.mesh.store import level_displacement, read_hierarchy
 
         output = tmp_path / f"crash{suffix}"
         self.ingest(tmp_path, suffix, sources[0])
         coarsen(output, [300])
-        assert has_hierarchy(output)
+        before = read_hierarchy(output)
         summary = self.ingest(tmp_path, suffix, sources[1])
-        assert not has_hierarchy(output)
-        assert any("mesh hierarchy was that of the former runs and is gone" in note for note in summary.notes)
+        after = read_hierarchy(output)
+        assert np.array_equal(after[1].kept, before[1].kept)
+        assert any("hierarchy (300 nodes) goes on with the new runs" in note for note in summary.notes)
+        runs = open_dataset(output, chunks=None)
+        kept = runs["displacement"].values[:, :, after[1].kept]
+        assert np.array_equal(level_displacement(output, 1), kept)
 
 
 @pytest.mark.usefixtures("quick_disk")

@@ -73,6 +73,15 @@ def test_held_nodes_keep_their_last_displacement() -> None:
     assert "keep their last displacement" in notes.lines[0]
 
 
+def test_where_elements_erode_nodes_are_held_without_being_asked() -> None:
+    campaign = replace(changed((4, slice(3, None), 17), np.nan), erodes=True)
+    run = Runs(campaign, 0, settings("mh"), Notes()).read(4)
+    before = plate.displacement(plate.parameters(6))[4]
+    np.testing.assert_array_equal(run[3:, 17], np.broadcast_to(before[2, 17], (4, 3)))
+    with pytest.raises(SurrogateError, match="run run_004, state 3, node 17"):
+        Runs(campaign, 0, settings("mh", overrides=["missing=refuse"]), Notes()).read(4)
+
+
 def test_infinite_values_are_never_held() -> None:
     runs = Runs(changed((4, 3, 17), np.inf), 0, settings("mh", overrides=["missing=hold"]), Notes())
     with pytest.raises(SurrogateError, match="run run_004, state 3, node 17"):

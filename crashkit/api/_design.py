@@ -1,0 +1,137 @@
+"""What a trained process says about its box: how wrong it is there, and which runs would help most."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crashkit.campaign.box import Box, CampaignError
+
+if TYPE_CHECKING:
+    from surrogates.design.criteria import Posterior
+    from surrogates.design.judgement import Judgement
+    from surrogates.surrogate import Surrogate
+
+# Points that stand for the box, and candidates for the next runs.
+_OVER, _CANDIDATES = 512, 1024
+# Variance of the constant that stands for the unknown mean of the process.
+_MEAN = 100.0
+
+
+@dataclass
+class Known:
+    """A trained process and its box, in the units of the process.
+
+    scale  (parameter,) SI value of one unit of the box
+    """
+
+    surrogate: Surrogate
+    box: Box
+    scale: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, surrogate: Surrogate, box: Box) -> Known:
+        """Raises CampaignError where the box is not that of the model."""
+        from data_schema import to_si
+
+        names, units = surrogate.record.ranges.names, surrogate.record.ranges.units
+        missing = sorted(set(names) ^ set(box.names))
+        if missing:
+            raise CampaignError(
+                f"the box and the runs differ in {', '.join(missing)}; the runs have {', '.join(names)}, the box "
+                f"{', '.join(box.names)}"
+            )
+        factors = []
+        for name, unit in zip(box.names, box.units, strict=True):
+            own = units[names.index(name)]
+            (mine, si), (theirs, theirs_si) = to_si(unit), to_si(own)
+            if si != theirs_si:
+                raise CampaignError(
+                    f"{name} is in {unit or 'no unit'} in the box and in {own or 'no unit'} in the runs"
+                )
+            factors.append(mine / theirs)
+        return cls(surrogate, box, np.array(factors))
+
+    def parameters(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(point, parameter) of the box -> in the order and units of the model."""
+        order = [self.box.names.index(n) for n in self.surrogate.record.ranges.names]
+        return np.asarray((points * self.scale)[:, order])
+
+    def of_runs(self, runs: tuple[list[str], list[str], NDArray[np.float64]]) -> NDArray[np.float64]:
+        """(run, parameter) of a dataset's names, units and values, in the order of the model."""
+        names, _, values = runs
+        return values[:, [names.index(n) for n in self.surrogate.record.ranges.names]]
+
+    def points(self, seed: int, count: int) -> NDArray[np.float64]:
+        """(point, parameter) all over the box, its constraints kept."""
+        from surrogates.design.space import fill
+
+        return fill(self.box.low, self.box.high, count, seed=seed, allowed=self.box.allowed, sequence="sobol")
+
+    def judge(self, confidence: float, seed: int = 0) -> Judgement:
+        """The error over the box, by runs that were left out while the process was trained."""
+        from surrogates.design.judgement import judge
+
+        left_out = self.surrogate.record.left_out
+        if len(left_out) < 2:
+            raise CampaignError("the model knows no errors of left-out runs; train it with more runs")
+        errors, deviations = np.array(list(left_out.values()), np.float64).T
+        return judge(errors, deviations, self.deviation(self.points(seed, _OVER)), confidence, seed)
+
+    def deviation(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(point,): what the process believes its error to be at points of the box, up to a factor."""
+        core, registration = _process(self.surrogate)
+        return core.deviation(registration.read(self.parameters(points)))
+
+    def posterior(self, known: NDArray[np.float64]) -> Posterior:
+        """The belief behind it, for runs at `known` (run, parameter) in the units of the model."""
+        from surrogates.data.inputs import over_range
+        from surrogates.design.criteria import Posterior
+
+        core, registration = _process(self.surrogate)
+        kernel = core.machine.kernel
+        corners = np.stack([core.low, core.high])
+
+        def inputs(parameters: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+            own = registration.read(parameters)
+            out = [over_range(own, corners)]
+            if not registration.symmetry.is_identity:
+                image = registration.read(registration.symmetry.images(parameters, self.surrogate.record.ranges.names))
+                if registration.symmetry.flagged:
+                    image[:, -1] = 1.0
+                out.append(over_range(image, corners))
+            return out
+
+        return Posterior(lambda a, b: kernel(a, b) + _MEAN, kernel.noise, inputs, known)
+
+    def best(self, known: NDArray[np.float64], count: int, seed: int) -> tuple[NDArray[np.float64], float]:
+        """The next `count` points (point, parameter) of the box, and by which share the mean deviation falls with them."""
+        from surrogates.design.criteria import ExpectedReduction
+
+        over, candidates = self.points(seed, _OVER), self.points(seed + 1, _CANDIDATES)
+        belief = self.posterior(known)
+        method = ExpectedReduction(belief, self.parameters(over))
+        chosen = method.ask(self.parameters(candidates), count)
+        found = self.parameters(candidates)
+        share = self.fall(known, chosen, seed)
+        places = [int(np.flatnonzero((found == row).all(axis=1))[0]) for row in chosen]
+        return candidates[places], share
+
+    def fall(self, known: NDArray[np.float64], points: NDArray[np.float64], seed: int) -> float:
+        """The mean deviation over the box with runs at `points` against that without, all in the units of the model."""
+        over, belief = self.parameters(self.points(seed, _OVER)), self.posterior(known)
+        before = np.sqrt(belief.variance(over) + belief.noise).mean()
+        return float(np.sqrt(belief.with_runs(points).variance(over) + belief.noise).mean() / before)
+
+
+def _process(surrogate: Surrogate):  # type: ignore[no-untyped-def]
+    from surrogates.models.pod_regression import PodRegression
+    from surrogates.regression.gaussian import Gaussian
+
+    core = surrogate.core
+    if not isinstance(core, PodRegression) or not isinstance(core.machine, Gaussian) or core.inputs != "trajectory":
+        raise CampaignError("proposals ask a process over whole runs; train pod-gpr on these runs")
+    return core, surrogate.registration

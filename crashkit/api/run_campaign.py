@@ -1,0 +1,278 @@
+"""From a campaign file to computed runs, a dataset, a surrogate and its judged error: the loop until a wish is met."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from crashkit.campaign.campaign import Campaign
+    from crashkit.campaign.executors import Executor
+    from surrogates.design.judgement import Judgement
+
+Progress = Callable[[int, int, str], None]
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class CampaignSummary:
+    """What a call of `run_campaign` did.
+
+    folder, dataset, model, page  where everything is; model is None where none was asked for
+    done, failed, refused         runs of the whole campaign
+    judgement                     error over the box with its interval, m; None where nothing was judged
+    why                           why the campaign ended
+    """
+
+    folder: Path
+    dataset: Path
+    model: Path | None
+    page: Path
+    done: int
+    failed: int
+    refused: int
+    judgement: Judgement | None
+    why: str
+
+
+def run_campaign(
+    study: str | Path,
+    folder: str | Path | None = None,
+    *,
+    until: str | None = None,
+    confidence: float | None = None,
+    most_runs: int | None = None,
+    executor: Executor | None = None,
+    retry: bool = False,
+    progress: Progress | None = None,
+    say: Say | None = None,
+) -> CampaignSummary:
+    """Compute the runs of a campaign, and go on until its wish is met.
+
+    Parameters
+    ----------
+    study
+        The campaign file (`crashkit.campaign.study.Study`).
+    folder
+        Where everything is kept; default: beside the file, called as it.
+    until, confidence
+        An error over the box such as "8 mm", and with which confidence it must be below; default: what the file says.
+        Without any, the first runs are computed and made a dataset, and that is all.
+    most_runs
+        End at this number of computed runs; default: what the file says.
+    executor
+        Where runs are computed; default: processes of this machine, or what the file says.
+    retry
+        Compute failed runs again.
+    progress, say
+        Called with (runs decided, runs in all, names of those running), and with a sentence after each step.
+
+    Returns
+    -------
+    CampaignSummary
+
+    Raises
+    ------
+    CrashkitError
+        Where the file, the folder, the solver or the disk does not do. What was computed stays; the same call goes on.
+
+    Notes
+    -----
+    No test run enters the judgement (`surrogates.design.judgement`). Interrupted or killed, the same call goes on.
+    """
+    from crashkit.extras import need
+
+    need("running a campaign", "campaign")
+    from crashkit.campaign.campaign import Campaign
+    from crashkit.campaign.status import write_page
+    from crashkit.campaign.study import length_of
+
+    speak = say or (lambda sentence: None)
+    with Campaign(study, folder, executor) as campaign:
+        wish = length_of(until) if until else campaign.study.wish()
+        share = confidence or campaign.study.confidence
+        limit = most_runs or campaign.study.most_runs
+        if retry:
+            campaign.retry()
+        if not campaign.table.runs():
+            campaign.add(_first_points(campaign), "start")
+        started = time.monotonic()
+        while True:
+            _compute(campaign, progress)
+            added = _ingest(campaign)
+            counts = {s: len(campaign.table.runs(s)) for s in ("done", "failed", "refused")}
+            speak(f"{counts['done']} runs done, {counts['failed']} failed, {counts['refused']} refused")
+            judged: Judgement | None = None
+            if wish is None:
+                why = "the runs of the campaign are computed; no error was asked for"
+                break
+            if counts["done"] < _FEWEST:
+                if not added:
+                    why = f"only {counts['done']} runs ended well; {_FEWEST} are needed to judge anything"
+                    break
+                campaign.add(_filling(campaign, campaign.study.design.batch), "filling")
+                continue
+            judged, after, points = _train_and_judge(campaign, share)
+            solver = sum(r.seconds or 0.0 for r in campaign.table.runs())
+            campaign.table.note_round(
+                {
+                    "error_m": judged.error, "low_m": judged.low, "high_m": judged.high, "after_m": after,
+                    "solver_seconds": solver, "confidence": share,
+                },
+                counts["done"],
+            )  # fmt: skip
+            write_page(campaign)
+            speak(
+                f"{counts['done']} runs: error {1e3 * judged.error:.2f} mm ({100 * share:.0f} % interval "
+                f"{1e3 * judged.low:.2f} to {1e3 * judged.high:.2f}); the next batch is expected to bring "
+                f"{1e3 * (judged.error - after):.2f} mm; {solver / 60:.1f} min of solver time so far"
+            )
+            stop = _why_stop(campaign, judged, after, wish, limit, counts["done"], started)
+            if stop:
+                why = stop
+                break
+            campaign.add(points[: max(0, limit - counts["done"])], "proposed")
+        page = write_page(campaign)
+        model = _train_wanted(campaign) if judged is not None else None
+        return CampaignSummary(
+            campaign.folder, campaign.dataset, model, page, counts["done"],
+            counts["failed"], counts["refused"], judged, why,
+        )  # fmt: skip
+
+
+# Fewer runs than this say nothing about errors.
+_FEWEST = 8
+
+
+def _train_and_judge(campaign: Campaign, confidence: float) -> tuple[Judgement, float, NDArray[np.float64]]:
+    """The error over the box by a process on all runs, what it is expected to be after the next batch, and that batch."""
+    from crashkit.api._design import Known
+    from crashkit.api.train import train
+
+    study = campaign.study
+    odd = [n for n, r in study.parameters.items() if r.odd]
+    told = [f"physics.odd=[{', '.join(odd)}]"] if odd else []
+    surrogate = train(
+        campaign.dataset, campaign.folder / "process", "pod-gpr", overrides=[*told, f"seed={study.design.seed}"],
+        overwrite=True,
+    )  # fmt: skip
+    known = Known.of(surrogate, study)
+    judged = known.judge(confidence, study.design.seed)
+    computed = campaign.points("done")
+    seed = study.design.seed + 1000 * len(computed)
+    if study.design.method == "expected-reduction":
+        points, share = known.best(known.parameters(computed), study.design.batch, seed)
+    else:
+        points = _filling(campaign, study.design.batch)
+        share = known.fall(known.parameters(computed), known.parameters(points), seed)
+    return judged, judged.error * share, points
+
+
+def _why_stop(
+    campaign: Campaign, judged: Judgement, after: float, wish: float, limit: int, runs: int, started: float
+) -> str | None:
+    """Why the campaign ends here; None where it goes on."""
+    study = campaign.study
+    if judged.below(wish):
+        return (
+            f"the error is below {1e3 * wish:g} mm with a confidence of {100 * judged.confidence:.0f} %: "
+            f"{1e3 * judged.error:.2f} mm with {runs} runs"
+        )
+    if runs >= limit:
+        return f"{runs} runs are computed, the most that were allowed; the error is {1e3 * judged.error:.2f} mm"
+    hours = (time.monotonic() - started) / 3600
+    if study.most_hours is not None and hours >= study.most_hours:
+        return f"{hours:.1f} hours are used up; the error is {1e3 * judged.error:.2f} mm"
+    if judged.error - after < study.least_gain * judged.error:
+        return (
+            f"another {study.design.batch} runs would gain less than {100 * study.least_gain:g} % of the error, which is "
+            f"{1e3 * judged.error:.2f} mm"
+        )
+    return None
+
+
+def _train_wanted(campaign: Campaign) -> Path | None:
+    """The model that the campaign file asks for, on all runs; the process itself where it asks for that."""
+    from crashkit.api.coarsen import coarsen
+    from crashkit.api.train import train
+    from crashkit.mesh.store import has_hierarchy
+
+    study, folder = campaign.study, campaign.folder / "model"
+    if study.model == "pod-gpr" and not study.settings:
+        return campaign.folder / "process"
+    if study.nodes and not has_hierarchy(campaign.dataset):
+        coarsen(campaign.dataset, nodes=list(study.nodes))
+    train(
+        campaign.dataset, folder, study.model, overrides=[f"{k}={v}" for k, v in study.settings.items()], overwrite=True
+    )
+    return folder
+
+
+def _first_points(campaign: Campaign) -> NDArray[np.float64]:
+    from surrogates.design.space import fill
+
+    study = campaign.study
+    sequence = "halton" if study.design.method == "expected-reduction" else study.design.method
+    return fill(
+        study.low, study.high, study.design.start, seed=study.design.seed, allowed=study.allowed, edges=True,
+        sequence=sequence,
+    )  # fmt: skip
+
+
+def _filling(campaign: Campaign, count: int) -> NDArray[np.float64]:
+    """The next points of the sequence that the campaign began with."""
+    from surrogates.design.space import fill
+
+    study, known = campaign.study, len(campaign.table.runs())
+    sequence = "halton" if study.design.method == "expected-reduction" else study.design.method
+    return fill(
+        study.low, study.high, count, seed=study.design.seed, allowed=study.allowed, skip=known, sequence=sequence
+    )
+
+
+def _compute(campaign: Campaign, progress: Progress | None) -> None:
+    """Compute what waits; the status page follows each change."""
+    from crashkit.campaign.status import write_page
+
+    seen = ""
+
+    def follow(done: int, total: int, note: str) -> None:
+        nonlocal seen
+        state = f"{done} {total} {note}"
+        if state != seen:
+            seen = state
+            write_page(campaign)
+        if progress is not None:
+            progress(done, total, note)
+
+    campaign.compute(follow)
+
+
+def _ingest(campaign: Campaign) -> int:
+    """Append the runs that are done and not in the dataset yet; returns how many."""
+    from crashkit.dataset import open_dataset
+    from crashkit.ingestion.ingest import ingest
+
+    known: set[str] = set()
+    if campaign.dataset.exists():
+        with open_dataset(campaign.dataset, chunks=None) as dataset:
+            known = {str(n) for n in dataset["sim"].values}
+    new = [
+        place
+        for run, place in zip(campaign.table.runs("done"), campaign.results(), strict=True)
+        if run.name not in known
+    ]
+    if not new:
+        return 0
+    told = campaign.study.ingest
+    ingest(
+        new, campaign.dataset, params=campaign.write_parameters(), units=told.units, reader=told.reader,
+        parts=told.parts, exclude_parts=told.exclude_parts, fields=told.fields, time=told.time,
+    )  # fmt: skip
+    return len(new)

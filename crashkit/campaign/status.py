@@ -1,0 +1,103 @@
+"""The state of a campaign as one HTML page, written anew after each event; no script, no network."""
+
+from __future__ import annotations
+
+import datetime
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crashkit.campaign.campaign import Campaign
+from crashkit.campaign.table import STATES
+
+COLOURS = {"waiting": "#9aa5b1", "running": "#2f7ed8", "done": "#2e9e5b", "failed": "#d64545", "refused": "#e0902f"}
+_SIZE, _PAD = 150.0, 8.0
+
+
+def status(campaign: Campaign) -> dict[str, Any]:
+    """Counts of runs by state, the rounds, seconds of solver time, and the newest wish."""
+    runs = campaign.table.runs()
+    counts = {state: sum(r.state == state for r in runs) for state in STATES}
+    seconds = sum(r.seconds or 0.0 for r in runs)
+    return {
+        "folder": str(campaign.folder), "runs": len(runs), **counts, "solver_seconds": seconds,
+        "rounds": campaign.table.rounds(), "wish_m": campaign.study.wish(),
+        "trouble": {r.name: f"{r.state}: {r.reason}" for r in runs if r.state in ("failed", "refused")},
+    }  # fmt: skip
+
+
+def write_page(campaign: Campaign) -> Path:
+    """Write FOLDER/status.html."""
+    from jinja2 import Environment, PackageLoader
+
+    runs = campaign.table.runs()
+    study = campaign.study
+    points = campaign.points()
+    pairs = [
+        {
+            "x": study.names[a],
+            "y": study.names[b],
+            "dots": _dots(points[:, [a, b]], study.low[[a, b]], study.high[[a, b]], runs),
+        }
+        for a, b in combinations(range(len(study.names)), 2)
+    ]
+    environment = Environment(loader=PackageLoader("crashkit.campaign", "templates"), autoescape=True)
+    found = status(campaign)
+    text = environment.get_template("status.html").render(
+        title=campaign.file.stem, status=found, runs=runs, names=study.names, units=study.units, pairs=pairs,
+        colours=COLOURS, curve=_curve(found["rounds"], study.wish()), size=_SIZE,
+        now=datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M:%S UTC"),
+    )  # fmt: skip
+    page = campaign.folder / "status.html"
+    beside = page.with_suffix(".partial")
+    beside.write_text(text, encoding="utf-8")
+    beside.replace(page)
+    return page
+
+
+def _dots(
+    points: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], runs: list[Any]
+) -> list[dict[str, Any]]:
+    unit = (points - low) / (high - low)
+    return [
+        {
+            "x": round(_PAD + float(p[0]) * (_SIZE - 2 * _PAD), 1),
+            "y": round(_SIZE - _PAD - float(p[1]) * (_SIZE - 2 * _PAD), 1),
+            "colour": COLOURS[run.state],
+            "name": f"{run.name}: {run.state}",
+        }
+        for p, run in zip(unit, runs, strict=True)
+    ]
+
+
+def _curve(rounds: list[dict[str, Any]], wish: float | None) -> dict[str, Any] | None:
+    """Error over runs with its interval, as points of a drawing 480 x 220; lengths in mm, logarithmic."""
+    known = [r for r in rounds if r.get("error_m")]
+    if not known:
+        return None
+    width, height, left, bottom = 480.0, 220.0, 52.0, 26.0
+    values = [v for r in known for v in (r["low_m"], r["high_m"], r["error_m"])] + ([wish] if wish else [])
+    first, last = min(values) * 0.9e3, max(values) * 1.1e3
+    most = max(r["runs"] for r in known)
+
+    def place(runs: float, value: float) -> tuple[float, float]:
+        up = np.log(value * 1e3 / first) / np.log(last / first)
+        return (
+            round(left + (width - left - 10) * runs / most, 1),
+            round(height - bottom - (height - bottom - 8) * float(up), 1),
+        )
+
+    return {
+        "width": width, "height": height, "left": left, "bottom": height - bottom,
+        "points": [
+            {"at": place(r["runs"], r["error_m"]), "low": place(r["runs"], r["low_m"]), "high": place(r["runs"], r["high_m"]),
+             "text": f"{r['runs']} runs: {1e3 * r['error_m']:.3g} mm ({1e3 * r['low_m']:.3g} to {1e3 * r['high_m']:.3g})"}
+            for r in known
+        ],
+        "wish": None if wish is None else place(0, wish)[1],
+        "ticks": [(f"{v:.3g}", place(0, v / 1e3)[1]) for v in np.geomspace(first, last, 4)],
+        "last": most,
+    }  # fmt: skip

@@ -1,0 +1,152 @@
+"""The campaign file: one YAML that says what varies, how one run is computed, and what is wished for."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+from crashkit.campaign.box import Box, CampaignError, checked, read_yaml
+
+
+def _split(value: Any) -> Any:
+    """A command may be written as one text; it is split as a shell splits words, and no shell ever sees it."""
+    return (
+        shlex.split(value) if isinstance(value, str) else [str(v) for v in value] if isinstance(value, list) else value
+    )
+
+
+def _seconds(value: Any) -> Any:
+    """Seconds, also from "90 s", "10 min", "2 h"."""
+    if not isinstance(value, str):
+        return value
+    number, _, unit = value.strip().partition(" ")
+    factor = {"": 1, "s": 1, "min": 60, "h": 3600, "d": 86400}.get(unit.strip())
+    try:
+        return float(number) * (factor or float("nan"))
+    except ValueError:
+        return value
+
+
+Command = Annotated[list[str], BeforeValidator(_split), Field(min_length=1)]
+Duration = Annotated[float, BeforeValidator(_seconds), Field(gt=0)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Finished(_Strict):
+    """How a run that ended well is known: `text` near the end of one of the files `file` (a pattern in its folder)."""
+
+    file: str
+    text: str
+
+
+class Quality(_Strict):
+    """Limits of a run, in per cent; a run beyond one of them is refused. None: no limit."""
+
+    energy_error: float | None = Field(15.0, gt=0)
+    mass_added: float | None = Field(10.0, gt=0)
+
+
+class Design(_Strict):
+    """start: space-filling runs first; batch: runs that are proposed at a time; seed: of everything random."""
+
+    start: int = Field(16, ge=2)
+    batch: int = Field(8, ge=1)
+    seed: int = Field(0, ge=0)
+    method: Literal["expected-reduction", "halton", "sobol", "random"] = "expected-reduction"
+
+
+class Ingest(_Strict):
+    """What `crashkit ingest` is told about the runs."""
+
+    units: str | None = None
+    reader: str | None = None
+    parts: tuple[str, ...] = ()
+    exclude_parts: tuple[str, ...] = ()
+    fields: tuple[str, ...] = ()
+    time: tuple[float, ...] | None = None
+
+
+class Study(Box):
+    """A campaign.
+
+    parameters, constraints  the box
+    template   deck files (patterns) into which `{{impact_speed}}` is written, with arithmetic: {{ "%10.4f" | format(t / 1000) }}
+    files      further files (patterns) that every run needs beside the deck
+    prepare    a command of the user's that writes the deck; {impact_speed} is a value, {study} this file's folder
+    command    the command that computes one run, in the run's folder
+    results    what ingest is given of a run's folder (a pattern); default: the folder
+    finished   how a run that ended well is known; default: what OpenRadioss and LS-DYNA write
+    at_a_time  runs computed at the same time; timeout: of one run, s or "10 min"
+    nodes      sizes of the mesh hierarchy, where the model wants one
+    model      what is trained (pod-gpr, mh, ...), with `settings`
+    until, confidence, most_runs, most_hours, least_gain   when the loop ends
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    template: tuple[str, ...] = ()
+    files: tuple[str, ...] = ()
+    prepare: Command | None = None
+    command: Command
+    results: str = ""
+    finished: Finished | None = None
+    quality: Quality = Quality(energy_error=15.0, mass_added=10.0)
+    at_a_time: int = Field(1, ge=1)
+    timeout: Duration = 24 * 3600.0
+    retries: int = Field(0, ge=0)
+    design: Design = Design(start=16, batch=8, seed=0)
+    ingest: Ingest = Ingest()
+    nodes: tuple[int, ...] = ()
+    model: str = "pod-gpr"
+    settings: dict[str, Any] = Field(default_factory=dict)
+    until: str | None = None
+    confidence: float = Field(0.9, gt=0.5, lt=1)
+    most_runs: int = Field(200, ge=1)
+    most_hours: float | None = Field(None, gt=0)
+    least_gain: float = Field(0.01, ge=0, lt=1)
+    executor: Literal["local", "slurm"] = "local"
+    slurm: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _whole(self) -> Study:
+        if not self.template and self.prepare is None:
+            raise ValueError("neither template nor prepare is given; one of them must write the deck of a run")
+        reserved = {"study", "run", "name"} & set(self.parameters)
+        if reserved:
+            raise ValueError(f"a parameter cannot be called {reserved.pop()!r}; that name means a folder in commands")
+        return self
+
+    def wish(self) -> float | None:
+        """The error that is wished for, m; None where the campaign has none."""
+        return None if self.until is None else length_of(self.until)
+
+
+def length_of(text: str) -> float:
+    """A length with its unit, such as "8 mm", in m. Raises CampaignError."""
+    from data_schema import UnknownUnits, to_si
+
+    number, _, unit = text.strip().partition(" ")
+    try:
+        if not unit:
+            digits = text.strip().rstrip("abcdefghijklmnopqrstuvwxyz")
+            number, unit = digits, text.strip()[len(digits) :]
+        factor, si = to_si(unit)
+        value = float(number) * factor
+    except (ValueError, UnknownUnits) as error:
+        raise CampaignError(f"{text!r} is no length; expected a number with a unit, such as '8 mm'") from error
+    if si != "m" or not value > 0:
+        raise CampaignError(f"{text!r} is no length above zero; expected such as '8 mm'")
+    return value
+
+
+def read_study(path: str | Path) -> Study:
+    """The campaign file at `path`. Raises CampaignError that names the place."""
+    study: Study = checked(Study, read_yaml(path), path)
+    study.wish()
+    return study

@@ -1,0 +1,94 @@
+"""`crashkit campaign`: from a parameter box and a solver to an error below a wish; `crashkit campaign status`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from crashkit.cli._console import fail, print_json, say, table, what_next
+from crashkit.cli._progress import Progress
+
+
+def command(
+    study: Annotated[Path, typer.Argument(help="Campaign file (YAML), or the word status.", show_default=False)],
+    where: Annotated[
+        Path | None, typer.Argument(help="With status: the campaign file or its folder.", show_default=False)
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Folder of the campaign.", show_default="beside the file, called as it"),
+    ] = None,
+    until: Annotated[
+        str, typer.Option(help='Error over the box to reach, such as "8 mm".', show_default="what the file says")
+    ] = "",
+    confidence: Annotated[
+        float | None, typer.Option(help="With which confidence the error must be below.", show_default="0.9")
+    ] = None,
+    most_runs: Annotated[
+        int | None, typer.Option(help="End at this number of runs.", min=1, show_default=False)
+    ] = None,
+    retry: Annotated[bool, typer.Option("--retry", help="Compute failed runs again.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Compute runs with your solver, and go on until the error is below a wish.
+
+    Interrupted or killed, the same command goes on; what was computed is not computed again.
+    """
+    if str(study) == "status":
+        _status(where or Path.cwd(), json)
+        return
+    from dataclasses import asdict
+
+    from crashkit.api.run_campaign import run_campaign
+
+    with Progress(f"campaign {study}", quiet=json) as shown:
+        try:
+            summary = run_campaign(
+                study, output, until=until or None, confidence=confidence, most_runs=most_runs, retry=retry,
+                progress=lambda done, total, note: shown.step("runs", done, total, note),
+                say=None if json else say,
+            )  # fmt: skip
+        except KeyboardInterrupt:
+            fail("interrupted; jobs were stopped and their runs wait: the same command goes on", code=130)
+    if json:
+        print_json(asdict(summary))
+        return
+    say(f"ended: {summary.why}")
+    if summary.done == 0:
+        fail(f"no run ended well; see {summary.page}, and the run.log of each run", code=1)
+    what_next(summary.page, ("info", summary.dataset))
+
+
+def _status(where: Path, as_json: bool) -> None:
+    """Counts and rounds of a campaign, also while another process runs it."""
+    from crashkit.campaign.table import FILE, STATES, Table
+    from crashkit.errors import CrashkitError
+
+    folder = where if where.is_dir() else where.with_suffix("")
+    if not (folder / FILE).exists():
+        raise CrashkitError(f"{folder}: no campaign is kept there (no {FILE}); give its folder or its campaign file")
+    runs_table = Table(folder)
+    runs, rounds = runs_table.runs(), runs_table.rounds()
+    runs_table.close()
+    counts: dict[str, Any] = {state: sum(r.state == state for r in runs) for state in STATES}
+    if as_json:
+        print_json({"folder": folder, **counts, "rounds": rounds})
+        return
+    say(f"{folder}: " + ", ".join(f"{n} {state}" for state, n in counts.items() if n))
+    for r in runs:
+        if r.state in ("failed", "refused"):
+            say(f"  {r.name} {r.state}: {r.reason}")
+    if rounds:
+        table(
+            "Error over the box",
+            ("runs", "error (mm)", "interval (mm)", "solver time (min)"),
+            (
+                (r["runs"], f"{1e3 * r['error_m']:.2f}", f"{1e3 * r['low_m']:.2f} to {1e3 * r['high_m']:.2f}",
+                 f"{r['solver_seconds'] / 60:.1f}")
+                for r in rounds
+            ),
+        )  # fmt: skip
+    if (folder / "status.html").exists():
+        say(f"{folder / 'status.html'}: the same as a page")

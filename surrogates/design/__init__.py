@@ -1,0 +1,1 @@
+"""Questions about the next runs: which to compute, and whether there are enough. Arrays in, arrays out."""
