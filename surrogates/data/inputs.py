@@ -67,7 +67,8 @@ class Ranges:
             slack = 1e-9 * max(abs(low), abs(high))
             if worst < low - slack or worst > high + slack:
                 span = f"{low / factor:g} to {high / factor:g}" if low < high else f"only {low / factor:g}"
-                said.append(f"{name} = {worst / factor:g} {unit} is outside the trained range {span} {unit}".rstrip())
+                behind = "" if unit in ("", "1") else f" {unit}"
+                said.append(f"{name} = {worst / factor:g}{behind} is outside the trained range {span}{behind}")
         first, last = self.time
         beyond = [t for t in (time.min(), time.max()) if t < first - 1e-12 or t > last * (1 + 1e-9) + 1e-12]
         if beyond:

@@ -1,18 +1,14 @@
-"""The band around predictions holds what it says, and derivatives are those of the prediction."""
+"""The band around predictions holds what it says."""
 
 from __future__ import annotations
 
 import numpy as np
-import plate
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from surrogates.errors import SurrogateError
-from surrogates.settings import settings as choose
-from surrogates.storage.folder import load, save
-from surrogates.training.train import train
-from surrogates.uncertainty import calibrate, coverage
+from surrogates.uncertainty import SHARES, Band, calibrate, coverage
 
 TIME = np.linspace(0.0, 0.02, 11)
 
@@ -69,55 +65,83 @@ def test_shares_it_has_no_quantile_for_are_refused(share: float) -> None:
         calibrate(distances(3, seed=0), TIME).half_width(share, TIME)
 
 
-SHORT = ("level.epochs=4", "level.latent=3", "level.batch=16", "validation.share=0.3")
+def test_each_validation_run_is_judged_by_the_others() -> None:
+    """A run that is k times as wrong as the only other one lies k times as far out as that one would have said."""
+    small, large = 0.002, 0.006
+    band = calibrate([np.full((11, 4), small, np.float32), np.full((11, 4), large, np.float32)], TIME)
+    typical = (small + large) / 2
+    np.testing.assert_allclose(band.half_width(0.9, TIME), large / small * typical, rtol=1e-5)
+    np.testing.assert_allclose(band.half_width(0.5, TIME), (large / small + small / large) / 2 * typical, rtol=1e-2)
 
 
-@pytest.mark.parametrize("model", ["mh", "podnn", "pod-gpr"])
-def test_bands_of_own_nodes_and_of_the_full_mesh_survive_storage(model: str, tmp_path) -> None:  # type: ignore[no-untyped-def]
-    fitted = train(plate.campaign(10), choose(model, overrides=SHORT))
-    stored = load(save(fitted, tmp_path / "model"))
-    for level in fitted.level_names.values():
-        for full in (False, True):
-            width = stored.band(0.9, [0.0, 0.011], level, full=full)
-            assert width.shape == (2, plate.SIDES[0] ** 2 if full else fitted.graphs.n_nodes(level))
-            np.testing.assert_array_equal(width, fitted.band(0.9, [0.0, 0.011], level, full=full))
+def test_two_validation_runs_already_hold_nine_tenths_of_a_new_run() -> None:
+    """Runs that differ as a whole: a scale taken from the judged runs themselves would hold 77 % only."""
+    random = np.random.default_rng(11)
+    pattern = (0.1 + TIME / TIME[-1])[:, None] * random.uniform(0.2, 2.0, 30)
+
+    def run() -> np.ndarray:
+        return (random.lognormal(0.0, 0.5) * pattern * random.gamma(4.0, 0.25, pattern.shape)).astype(np.float32)
+
+    held = [coverage(np.stack([run()]), calibrate([run(), run()], TIME).half_width(0.9, TIME)) for _ in range(200)]
+    assert 0.84 < np.mean(held) < 0.93
 
 
-def test_without_validation_runs_there_is_no_band() -> None:
-    fitted = train(plate.campaign(6), choose("mh", overrides=(*SHORT, "validation.measure=paper")))
-    with pytest.raises(SurrogateError, match="no band for MH1: too few validation runs"):
-        fitted.band()
+def test_the_band_is_the_quantile_of_pooled_ratios_times_the_scale() -> None:
+    """The definition, in loops (Dunn, Wasserman, Ramdas 2022, pooling CDFs)."""
+    given_ = distances(3, seed=8, nodes=6)
+
+    def scale(runs: list[np.ndarray]) -> np.ndarray:
+        node = np.mean([r.mean(axis=0) for r in runs], axis=0)
+        state = np.mean([r.mean(axis=1) for r in runs], axis=0)
+        return state[:, None] / state.mean() * node
+
+    ratios = [given_[k] / scale([r for j, r in enumerate(given_) if j != k]) for k in range(3)]
+    band = calibrate(given_, TIME)
+    assert band.runs == 3
+    for share in (0.5, 0.77, 0.99):
+        expected = np.quantile(np.concatenate([r.ravel() for r in ratios]), share) * scale(given_)
+        np.testing.assert_allclose(band.half_width(share, TIME), expected, rtol=1e-5)
 
 
-@pytest.mark.parametrize("overrides", [(), ("transfer.encoder=concat", "level.convolution=gcn2"), ("unified=true",)])
-def test_automatic_derivatives_agree_with_differences(overrides: tuple[str, ...]) -> None:
-    fitted = train(plate.campaign(10), choose("mh", overrides=(*SHORT, "level.mlp.activation=tanh", *overrides)))
-    at = np.array([20.0, 1.0, 3e8])
-    found = fitted.sensitivity(at, level=1)
-    assert found.shape == (len(plate.TIME), plate.SIDES[1] ** 2, 3, 3)
-    for k, step in enumerate((0.05, 0.05, 2e6)):
-        move = step * np.eye(3)[k]
-        high, low = (fitted.predict(at + s * move, level=1).astype(np.float64) for s in (1, -1))
-        slope = (high - low) / (2 * step)
-        assert np.abs(found[..., k] - slope).max() <= 0.02 * np.abs(slope).max()
+def test_between_states_and_shares_the_width_is_interpolated() -> None:
+    factor = np.linspace(1.0, 2.0, len(SHARES))
+    band = Band(np.array([1.0, 3.0], np.float32), np.array([0.0, 2.0, 4.0]), np.array([0.0, 1.0, 3.0]), factor, 2)
+    found = band.half_width(0.5, np.array([0.0, 0.5, 2.0, 9.0]))
+    np.testing.assert_allclose(found, [[0, 0], [1, 3], [3, 9], [4, 12]])
+    assert found.dtype == np.float32
+    middle = band.half_width((SHARES[3] + SHARES[4]) / 2, np.array([1.0]))
+    np.testing.assert_allclose(middle[0], 2.0 * (factor[3] + factor[4]) / 2 * np.array([1, 3]), rtol=1e-6)
 
 
-def test_derivatives_of_chosen_nodes_are_a_part_of_all() -> None:
-    fitted = train(plate.campaign(10), choose("mh", overrides=SHORT))
-    at = [20.0, 1.0, 3e8]
-    np.testing.assert_array_equal(fitted.sensitivity(at, nodes=[3, 7]), fitted.sensitivity(at)[:, [3, 7]])
+def test_shares_go_in_hundredths_from_a_half_to_99_in_100() -> None:
+    np.testing.assert_allclose(SHARES, np.arange(50, 100) / 100)
+    band = calibrate(distances(3, seed=0), TIME)
+    assert (band.half_width(0.5, TIME) <= band.half_width(0.99, TIME)).all()
 
 
-def test_derivatives_of_gaussian_processes_are_differences() -> None:
-    fitted = train(plate.campaign(10), choose("pod-gpr"))
-    at = np.array([20.0, 1.0, 3e8])
-    found = fitted.sensitivity(at, [0.02])[..., 0]
-    step = np.array([1e-2, 0.0, 0.0])
-    slope = fitted.predict(at + step, [0.02]) - fitted.predict(at - step, [0.02])
-    np.testing.assert_allclose(found, slope / 2e-2, atol=0.02 * np.abs(found).max())
+def test_a_node_or_state_that_was_exact_keeps_a_thousandth_of_the_mean() -> None:
+    given_ = distances(3, seed=6)
+    for d in given_:
+        d[:, 7] = 0
+        d[0] = 0
+    band = calibrate(given_, TIME)
+    mean = np.mean(given_)
+    assert band.node[7] == pytest.approx(1e-3 * mean, rel=1e-5)
+    assert band.state[0] == pytest.approx(1e-3)
+    assert np.isfinite(band.half_width(0.99, TIME)).all()
 
 
-def test_sensitivities_are_those_of_one_run() -> None:
-    fitted = train(plate.campaign(10), choose("podnn", overrides=SHORT))
-    with pytest.raises(SurrogateError, match="those of one run; found parameters of 2"):
-        fitted.sensitivity(plate.parameters(2))
+def test_of_many_nodes_some_spread_over_all_are_pooled_and_change_nothing() -> None:
+    """A third of the nodes errs differently in kind; were only the first nodes pooled, the band would miss it."""
+    random = np.random.default_rng(3)
+    spread = np.repeat([0.1, 0.1, 1.0], 3000)
+    runs = [np.exp(spread * random.normal(size=(3, 9000))).astype(np.float32) for _ in range(2)]
+    band = calibrate(runs, TIME[:3])
+    new = np.exp(spread * random.normal(size=(3, 9000))).astype(np.float32)
+    assert coverage(new, band.half_width(0.9, TIME[:3])) == pytest.approx(0.9, abs=0.02)
+    assert len(band.node) == 9000
+
+
+def test_coverage_counts_what_lies_on_the_edge_of_the_band_as_inside() -> None:
+    width = np.array([[1.0, 2.0]], np.float32)
+    assert coverage(np.array([[[1.0, 2.1]], [[0.5, 2.0]]], np.float32), width) == 0.75

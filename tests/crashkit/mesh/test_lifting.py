@@ -7,8 +7,9 @@ import pytest
 from scipy import sparse
 
 from crashkit.mesh import lifting
-from crashkit.mesh.levels import Hierarchy, Level
+from crashkit.mesh.levels import Hierarchy
 from crashkit.mesh.lifting import LiftingMeter, lift
+from data_schema.levels import Level
 
 
 def level(index: int, kept: list[int], to_full: list[list[float]]) -> Level:

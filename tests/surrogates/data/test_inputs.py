@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import plate
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from surrogates.data.inputs import InputScaling, Ranges
+from surrogates.data.inputs import InputScaling, Ranges, rms
 
 NAMES, UNITS = ("impact_speed", "impact_angle", "yield_stress"), ("m s-1", "degree", "Pa")
 
@@ -72,3 +73,101 @@ def test_values_outside_are_told_with_name_unit_and_range() -> None:
         "time = 0.05 s is outside the trained range 0 to 0.03 s",
     ]
     assert r.outside(np.array([30.0, -10.0, 3e8]), np.array([0.0, 0.03])) == []
+
+
+def box(
+    *bounds: tuple[float, float], units: tuple[str, ...] | None = None, time: tuple[float, float] = (0.0, 1.0)
+) -> Ranges:
+    low, high = np.array(bounds, float).T
+    return Ranges(tuple("abc"[: len(bounds)]), units or ("m",) * len(bounds), low, high, time)
+
+
+def test_ranges_are_lowest_and_highest_of_the_training_runs() -> None:
+    found = Ranges.of(
+        ["a", "b"], ["m", "s"], np.array([[1.0, 5.0], [3.0, -2.0], [2.0, 0.0]]), np.array([0.5, 0.7, 2.0])
+    )
+    assert (found.names, found.units) == (("a", "b"), ("m", "s"))
+    assert (found.low.tolist(), found.high.tolist(), found.time) == ([1.0, -2.0], [3.0, 5.0], (0.5, 2.0))
+    assert found.constant == ()
+
+
+def test_what_lies_below_is_told_as_what_lies_above() -> None:
+    r = box((1.0, 2.0), (-3.0, 3.0), (0.0, 1.0), units=("m", "", "1"), time=(0.1, 0.2))
+    assert r.outside(np.array([0.5, 4.0, 2.0]), np.array([0.05, 0.15])) == [
+        "a = 0.5 m is outside the trained range 1 to 2 m",
+        "b = 4 is outside the trained range -3 to 3",
+        "c = 2 is outside the trained range 0 to 1",
+        "time = 0.05 s is outside the trained range 0.1 to 0.2 s",
+    ]
+
+
+def test_of_several_runs_the_one_furthest_outside_is_told() -> None:
+    r = box((1.0, 2.0))
+    many = np.array([[2.5], [-3.0], [1.5], [4.0]])
+    assert r.outside(many, np.array([0.0])) == ["a = -3 m is outside the trained range 1 to 2 m"]
+    assert r.outside(many[[0, 2]], np.array([0.0])) == ["a = 2.5 m is outside the trained range 1 to 2 m"]
+
+
+def test_rounding_is_not_outside() -> None:
+    r = box((1e8, 2e8), (-2.0, -1.0), time=(0.0, 0.03))
+    just = np.array([2e8 * (1 + 1e-10), -2.0 * (1 + 1e-10)])
+    assert r.outside(just, np.array([-1e-13, 0.03 * (1 + 1e-10)])) == []
+    assert len(r.outside(np.array([2e8 * (1 + 1e-8), -2.0 * (1 + 1e-8)]), np.array([0.03 * (1 + 1e-8)]))) == 3
+    assert len(r.outside(np.array([1.5e8, -1.0]), np.array([-1e-11]))) == 1
+
+
+@pytest.mark.parametrize("bounds", [(-1.0, 2.0), (-2.0, -1.0), (1.0, 2.0)])
+@pytest.mark.parametrize("time", [(0.0, 2.0), (1.0, 3.0)])
+def test_products_fill_their_range(bounds: tuple[float, float], time: tuple[float, float]) -> None:
+    scaling = InputScaling(box(bounds, (0.0, 1.0), time=time), products=True)
+    a, t = (m.ravel() for m in np.meshgrid(np.linspace(*bounds, 21), np.linspace(*time, 21)))
+    out = scaled(scaling, np.stack([a, np.full_like(a, 0.5)], axis=1), t)
+    product = a * t
+    np.testing.assert_allclose(out[:, 3], 2 * (product - product.min()) / np.ptp(product) - 1, atol=1e-6)
+
+
+def test_sine_and_cosine_of_a_symmetric_range_fill_theirs() -> None:
+    out = scaled(
+        InputScaling(box((-60.0, 60.0), units=("deg",)), angles=True), np.array([[-60.0], [0.0], [60.0]]), np.zeros(3)
+    )
+    np.testing.assert_allclose(out[:, 2], [-1, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(out[:, 3], [-1, 1, -1], atol=1e-6)
+
+
+@pytest.mark.parametrize(("unit", "more"), [("degree", 2), ("deg", 2), ("°", 2), ("m", 0), ("rad", 0)])
+def test_only_parameters_in_degree_have_sine_and_cosine(unit: str, more: int) -> None:
+    r = box((0.0, 1.0), (0.0, 30.0), units=("m", unit))
+    assert InputScaling(r, angles=True).size == 3 + more
+    assert InputScaling(r).size == 3
+
+
+def test_columns_are_parameters_time_products_then_sines_and_cosines() -> None:
+    r = box((-1.0, 1.0), (-90.0, 90.0), (-180.0, 180.0), units=("m", "deg", "deg"), time=(-1.0, 1.0))
+    out = scaled(InputScaling(r, products=True, angles=True), np.array([[0.5, 30.0, -90.0]]), np.array([0.5]))[0]
+    np.testing.assert_allclose(out[:4], [0.5, 1 / 3, -0.5, 0.5], atol=1e-6)
+    np.testing.assert_allclose(out[4:7], [0.25, 1 / 6, -0.25], atol=1e-6)
+    assert len(out) == 11
+    assert out[7] == pytest.approx(0.5, abs=1e-6)  # sin 30, over -1 .. 1
+    assert out[9] == pytest.approx(2 * np.cos(np.radians(30)) - 1, abs=1e-6)  # cos 30, over 0 .. 1
+
+
+def test_a_small_change_of_a_large_parameter_is_seen() -> None:
+    """In single precision 3e8 and 3e8 + 10 are the same."""
+    scaling = InputScaling(box((3e8, 3e8 + 100)))
+    out = scaled(scaling, np.array([[3e8 + 10], [3e8 + 20]]), np.zeros(2))
+    np.testing.assert_allclose(out[:, 0], [-0.8, -0.6], atol=1e-6)
+    assert out.dtype == torch.float32
+
+
+def test_the_ranges_are_not_among_the_weights() -> None:
+    assert InputScaling(box((0.0, 1.0))).state_dict() == {}
+
+
+@pytest.mark.parametrize("kind", [lambda u: u, torch.from_numpy], ids=["numpy", "torch"])
+def test_rms_is_the_root_of_the_mean_square_of_all_components(kind) -> None:  # type: ignore[no-untyped-def]
+    u = np.zeros((2, 2, 3), np.float32)
+    u[0, 0] = [1, 2, 2]
+    u[1, 1] = [0, 0, 5]
+    assert rms(kind(u)) == pytest.approx(np.sqrt((9 + 25) / 12))
+    assert rms(kind(np.zeros((2, 2, 3), np.float32))) == 1.0
+    assert rms(kind(np.full((2, 2, 3), 1e-25, np.float32))) == pytest.approx(1e-25, rel=1e-6)
