@@ -44,7 +44,7 @@ def coarse_cells(faces: NDArray, part: NDArray, edges: NDArray, parts: NDArray[n
     nodes, numbers = [np.empty((0, 3), np.int64)], [np.empty(0, np.int64)]
     for p in range(n_parts):
         word, bit = p // 64, np.uint64(p % 64)
-        member = (parts[:, word] >> bit & np.uint64(1)).astype(bool)
+        member = (parts[:, word] >> bit & np.uint64(1)) != 0
         triangles = faces[part == p].astype(np.int64)
         within = edges[member[edges].all(axis=1)]
         segments = without_sides(within, triangles)
@@ -130,21 +130,21 @@ def _locate(
     points: NDArray[np.float64], coarse: NDArray[np.float64], nodes: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     from vtkmodules.vtkCommonCore import reference
-    from vtkmodules.vtkCommonDataModel import vtkGenericCell, vtkStaticCellLocator
+    from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
 
     locator = vtkStaticCellLocator()
     # Keeps the cell order of `nodes`, unlike polygonal data, which puts points before lines before triangles.
     grid = _grid(coarse, nodes)
     locator.SetDataSet(grid)
     locator.BuildLocator()
-    cell, number, sub, distance2, foot = vtkGenericCell(), reference(0), reference(0), reference(0.0), [0.0, 0.0, 0.0]
+    number, sub, distance2, foot = reference(0), reference(0), reference(0.0), [0.0, 0.0, 0.0]
     out, squared = np.empty(len(points), np.int64), np.empty(len(points))
     # VTK's type hints know no references, which its functions with results in arguments need.
     find: Any = locator.FindClosestPoint
     out_number: Any = number
     out_distance2: Any = distance2
     for k, point in enumerate(points.tolist()):
-        find(point, foot, cell, number, sub, distance2)
+        find(point, foot, number, sub, distance2)
         out[k], squared[k] = out_number.get(), out_distance2.get()
     return out, squared
 
