@@ -197,8 +197,8 @@ def test_runs_that_share_one_moment_only_have_that() -> None:
 
 
 def test_runs_without_an_output_time_where_all_are_need_to_be_told_times() -> None:
-    with pytest.raises(DataError, match=r"14.8 to 15.2 s; give --time"):
-        common_time([seconds(0, 10, 20, 30), seconds(14.8, 14.9, 15, 15.1, 15.2)])
+    with pytest.raises(DataError, match=r"14.995 to 15.005 s; give --time"):
+        common_time([seconds(0, 10, 20, 30), seconds(14.995, 14.998, 15, 15.002, 15.005)])
 
 
 @pytest.mark.parametrize(
