@@ -113,7 +113,8 @@ def structure_of(
         face_part=new_part[np.concatenate([mesh.face_part[shells], mesh.cell_part[skin_cell]])],
         face_id=np.concatenate([mesh.face_id[shells], mesh.cell_id[skin_cell]]).astype(np.int64),
         face_source=np.concatenate([shells, -1 - skin_cell]).astype(np.int64),
-        cell_nodes=number[mesh.cell_nodes[cells]],
+        # Without cells there are no corners either, as in a dataset that is read back.
+        cell_nodes=number[mesh.cell_nodes[cells]] if len(mesh.cell_part[cells]) else np.empty((0, 0), np.int32),
         cell_type=mesh.cell_type[cells],
         cell_part=new_part[mesh.cell_part[cells]],
         cell_id=mesh.cell_id[cells],

@@ -157,3 +157,19 @@ def without_a_face(mesh: RunMesh) -> RunMesh:
 def test_another_mesh_is_refused_with_the_place(change, told: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(DataError, match=told):
         matched(structure_of(plate()), structure_of(change(plate())))
+
+
+def test_a_mesh_whose_cells_are_all_left_out_is_as_one_without_cells() -> None:
+    shells, beam = plate(), block()
+    both = replace(
+        shells,
+        cell_nodes=np.array([[0, 1]], np.int32),
+        cell_type=np.array([3], np.uint8),
+        cell_part=np.array([len(shells.parts)], np.int32),
+        cell_id=np.array([99]),
+        parts=(*shells.parts, Part(50, "sled")),
+    )
+    found = structure_of(both, exclude_parts=["sled"])
+    assert found.cell_nodes.shape == structure_of(shells).cell_nodes.shape
+    assert matched(structure_of(shells), found).n_nodes == found.n_nodes
+    assert len(structure_of(beam).cell_nodes) == 4
