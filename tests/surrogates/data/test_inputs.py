@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from surrogates.data.inputs import InputScaling, Ranges, rms
+from surrogates.data.inputs import InputScaling, Ranges, far_outside, over_range, rms
 
 NAMES, UNITS = ("impact_speed", "impact_angle", "yield_stress"), ("m s-1", "degree", "Pa")
 
@@ -171,3 +171,38 @@ def test_rms_is_the_root_of_the_mean_square_of_all_components(kind) -> None:  # 
     assert rms(kind(u)) == pytest.approx(np.sqrt((9 + 25) / 12))
     assert rms(kind(np.zeros((2, 2, 3), np.float32))) == 1.0
     assert rms(kind(np.full((2, 2, 3), 1e-25, np.float32))) == pytest.approx(1e-25, rel=1e-6)
+
+
+def test_values_outside_are_told_in_the_unit_people_write() -> None:
+    r = Ranges(("yield",), ("Pa",), np.array([2e8]), np.array([3e8]), (0.0, 1.0), (("MPa", 1e6),))
+    assert r.outside(np.array([4e8]), np.zeros(1)) == ["yield = 400 MPa is outside the trained range 200 to 300 MPa"]
+    constant = Ranges(("yield",), ("Pa",), np.array([2e8]), np.array([2e8]), (0.0, 1.0), (("MPa", 1e6),))
+    assert constant.outside(np.array([4e8]), np.zeros(1)) == [
+        "yield = 400 MPa is outside the trained range only 200 MPa"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("parameters", "time", "far"),
+    [
+        ([3.0, 5.0], [0.1, 0.3], []),
+        ([4.4, 5.0], [0.06, 0.34], []),
+        ([4.6, 5.0], [0.1], ["a"]),
+        ([0.2, 5.0], [0.1], ["a"]),
+        ([0.4, 5.0], [0.1], []),
+        ([2.0, 5.1], [0.1], ["b"]),
+        ([2.0, 4.9], [0.1], ["b"]),
+        ([2.0, 5.0], [0.04, 0.2], ["time"]),
+        ([2.0, 5.0], [0.2, 0.36], ["time"]),
+        ([[2.0, 5.0], [9.0, 6.0]], [0.36], ["a", "b", "time"]),
+    ],
+)
+def test_far_outside_is_more_than_a_quarter_of_the_range(parameters: list, time: list[float], far: list[str]) -> None:
+    r = box((1.0, 3.8), (5.0, 5.0), time=(0.1, 0.3))
+    assert far_outside(r, np.array(parameters), np.array(time)) == far
+
+
+def test_inputs_over_the_range_of_others_and_without_what_is_constant_there() -> None:
+    over = np.array([[0.0, 7.0, 10.0], [4.0, 7.0, 20.0]])
+    np.testing.assert_allclose(over_range(np.array([[1.0, 7.0, 25.0]]), over), [[-0.5, 2.0]])
+    np.testing.assert_allclose(over_range(np.array([4.0, 0.0, 15.0]), over), [[1.0, 0.0]])
