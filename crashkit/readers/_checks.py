@@ -79,6 +79,18 @@ def require_options(reader: str, options: Mapping[str, object], known: Sequence[
             raise CrashkitError(f"reader {reader!r} has no option {name!r}; {ours}")
 
 
+def time_step_option(options: Mapping[str, object]) -> float | None:
+    """The option `time_step`, the time between two states. Raises CrashkitError where it is no time."""
+    given = options.get("time_step")
+    try:
+        step = None if given is None else float(str(given))
+    except ValueError:
+        step = float("nan")
+    if step is not None and not 0 < step < float("inf"):
+        raise CrashkitError(f"--time-step is {given!r}; expected the time between two states, such as 0.001")
+    return step
+
+
 def is_damaged_hdf5(path: Path) -> bool:
     """Whether a file has the signature of HDF5 and still cannot be opened; several formats lie in such files."""
     import h5py

@@ -83,6 +83,7 @@ class D3plotFile:
                 "the file is damaged, copy it again"
             )
         self.blocks = self._place_blocks()
+        self.shells_withheld = self._unknown_of_shells()
         self.states: list[StateAt] = []
         self.problems: list[str] = []
         self._find_states(first, end, geometry=True)
@@ -149,12 +150,14 @@ class D3plotFile:
             "beam": h.n_beams * h.n_beam_vars,
             "shell": shells * h.n_shell_vars,
         }
+        self._n_shells = shells
         if h.has_node_deletion_data:
             lengths["node_alive"] = h.n_nodes
         elif h.has_element_deletion_data:
             counts = (h.n_solids, h.n_thick_shells, h.n_shells, h.n_beams)
             for kind, count in zip(("solid", "tshell", "shell", "beam"), counts, strict=True):
                 lengths[f"{kind}_alive"] = count
+        lengths["sph"] = h.n_sph_nodes * int(self._lasso._sph_info.n_sph_vars)
         blocks, start = {}, 0
         for name, length in lengths.items():
             blocks[name] = (start, int(length))
@@ -203,10 +206,80 @@ class D3plotFile:
 
     def elements(self, kind: str, state: int) -> dict[str, NDArray[Any]]:
         """Element results of one state by lasso-python's names, (1, element, ...); `kind` as the block is called."""
-        read = {"solid": "solids", "tshell": "tshell", "beam": "beams", "shell": "shell"}[kind]
+        if kind == "shell" and self.shells_withheld:
+            return self._shells(state)
+        read = {"solid": "solids", "tshell": "tshell", "beam": "beams", "shell": "shell", "sph": "sph"}[kind]
         found: dict[str, NDArray[Any]] = {}
         with guarded(self.states[state].file):
             getattr(self._lasso, f"_read_states_{read}")(self.block(kind, state)[None], 0, found)
+        return found
+
+    def particle_alive(self, state: int) -> NDArray[np.bool_]:
+        """(particle,): the first word of a particle is its material, with a minus once it is deleted."""
+        return np.asarray(self.block("sph", state).reshape(self.header.n_sph_nodes, -1)[:, 0] > 0)
+
+    @property
+    def particle_fields(self) -> dict[str, bool]:
+        """Which results of particles a state holds, by lasso-python's names."""
+        info = self._lasso._sph_info
+        return {
+            "sph_radius": info.has_influence_radius,
+            "sph_pressure": info.has_particle_pressure,
+            "sph_stress": info.has_stresses,
+            "sph_effective_plastic_strain": info.has_plastic_strain,
+            "sph_density": info.has_material_density,
+            "sph_internal_energy": info.has_internal_energy,
+            "sph_n_neighbors": info.has_n_affecting_neighbors,
+            "sph_strain": info.has_strain,
+            "sph_strainrate": info.has_strainrate,
+            "sph_mass": info.has_mass,
+        }
+
+    def _unknown_of_shells(self) -> dict[str, str]:
+        """Fields of shells whose place in a state is not known -> why; empty where every word is accounted for.
+
+        A shell's words begin with its layers, forces and thickness. Behind them stand the strain and, where
+        *DATABASE_EXTENT_BINARY asks for them (STRFLG), plastic and thermal strain tensors, whose number of layers the
+        file does not tell.
+        """
+        h = self.header
+        front = self._layer_words * h.n_shell_tshell_layers + 8 * h.has_shell_forces + 4 * h.has_shell_extra_variables
+        known = front + 12 * h.has_element_strain
+        tensors = h.has_solid_shell_plastic_strain_tensor or h.has_solid_shell_thermal_strain_tensor
+        if not h.n_shell_vars or (h.n_shell_vars == known and not tensors):
+            return {}
+        if tensors and h.n_shell_vars > front and (h.n_shell_vars - front) % 6 == 0:
+            kind = "plastic" if h.has_solid_shell_plastic_strain_tensor else "thermal"
+            return {
+                "strain": f"shells hold {kind} strain tensors (IDTDT = {h.raw_header['idtdt']}, asked for by STRFLG of "
+                "*DATABASE_EXTENT_BINARY), which strains cannot be told from; compute the run without them"
+            }
+        why = (
+            f"shells hold {h.n_shell_vars} words each, the header's output options (*DATABASE_EXTENT_BINARY) account for "
+            f"{known}"
+        )
+        return dict.fromkeys(("stress", "von_mises", "plastic_strain", "strain", "thickness"), why)
+
+    @property
+    def _layer_words(self) -> int:
+        h = self.header
+        return int(6 * h.has_shell_tshell_stress + h.has_shell_tshell_pstrain + h.n_shell_tshell_history_vars)
+
+    def _shells(self, state: int) -> dict[str, NDArray[Any]]:
+        """Results of shells up to what is not known, as `elements` gives them."""
+        h = self.header
+        words = self.block("shell", state).reshape(1, self._n_shells, h.n_shell_vars)
+        layers = h.n_shell_tshell_layers
+        behind = layers * self._layer_words
+        layered = words[:, :, :behind].reshape(1, self._n_shells, layers, self._layer_words)
+        stress = 6 * h.has_shell_tshell_stress
+        found = {}
+        if h.has_shell_tshell_stress:
+            found["element_shell_stress"] = layered[..., :6]
+        if h.has_shell_tshell_pstrain:
+            found["element_shell_effective_plastic_strain"] = layered[..., stress]
+        if h.has_shell_extra_variables:
+            found["element_shell_thickness"] = words[:, :, behind + 8 * h.has_shell_forces]
         return found
 
 

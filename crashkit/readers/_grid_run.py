@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,15 @@ from crashkit.errors import ReadError
 from crashkit.readers._cells import shell_faces
 from crashkit.readers._checks import holds_positions, reading, require_finite, time_problems
 from crashkit.readers._grid import Grid, GridSource, Place
-from crashkit.readers._names import DISPLACEMENT_NAMES, WALL_NAME, field_name, quantity
+from crashkit.readers._names import (
+    DISPLACEMENT_NAMES,
+    ELEMENT_IDS,
+    NODE_IDS,
+    WALL_NAME,
+    field_name,
+    quantity,
+    vectors_among,
+)
 from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh
 
 # VTK cell type -> (corners that are kept, in the order of the linear cell, its type). Middle nodes are left out.
@@ -40,11 +48,9 @@ _CELLS = {
 }
 _TRIANGLE, _QUAD, _POLYGON, _LINE, _POLYLINE, _VERTEX, _POLYVERTEX = 5, 9, 7, 3, 4, 1, 2
 # Names in lower case, as the solvers' converters write them.
-_NODE_IDS = ("node_id", "node_ids", "globalnodeid", "globalids", "global_ids")
-_ELEMENT_IDS = ("element_id", "element_ids", "globalelementid", "globalids", "global_ids", "face_id")
 _PARTS = ("part_id", "part_ids", "part", "material_id", "materialids", "materialid", "objectid")
 _ALIVE = ("erosion_status", "alive", "status")
-_NO_FIELDS = {*_NODE_IDS, *_ELEMENT_IDS, *_PARTS, *_ALIVE, "vtkghosttype", "vtkoriginalpointids", "vtkoriginalcellids"}
+_NO_FIELDS = {*NODE_IDS, *ELEMENT_IDS, *_PARTS, *_ALIVE, "vtkghosttype", "vtkoriginalpointids", "vtkoriginalcellids"}
 # A displacement beside moving points may differ from their movement by rounding only.
 _AGREE = 1e-4
 
@@ -57,8 +63,19 @@ class GridRun(Run):
         self.files, self.time = source.files, source.time
         if not len(self.time):
             raise ReadError(f"{source.files[0]}: no state found")
-        grid = source.first()
-        grid.check(source.place(0))
+        first = source.first()
+        first.check(source.place(0))
+        # A displacement kept as three scalars, told by their names.
+        scalars = {n: v for n, v in first.point_data.items() if v.ndim == 1}
+        self._joined = {
+            name: titles
+            for name, titles in vectors_among(list(scalars)).items()
+            if field_name(name) in DISPLACEMENT_NAMES and name not in first.point_data
+        }
+        taken = {title for titles in self._joined.values() for title in titles}
+        vectors = {name: np.stack([scalars[t] for t in titles], 1) for name, titles in self._joined.items()}
+        kept = {n: v for n, v in first.point_data.items() if n not in taken}
+        grid = replace(first, point_data={**kept, **vectors})
         require_finite(grid.points, "the position", source.place(0))
         shapes: dict[tuple[Place, str], tuple[int, ...]] = {("point", n): v.shape for n, v in grid.point_data.items()}
         self._shapes = shapes | {("cell", n): v.shape for n, v in grid.cell_data.items()}
@@ -68,7 +85,8 @@ class GridRun(Run):
         self._arrays, self.fields = self._offered(grid)
         self.parameters: Mapping[str, Parameter] = {}
         self._life = _find(grid.cell_data, _ALIVE, everywhere=False)
-        told = {grid.units.get(n) for n in grid.point_data if field_name(n) in DISPLACEMENT_NAMES}
+        titles = [t for n in grid.point_data for t in self._joined.get(n, (n,)) if field_name(n) in DISPLACEMENT_NAMES]
+        told = {grid.units.get(t) for t in titles}
         self.units = "SI" if told == {"m"} else None
         self.problems = (
             *source.problems,
@@ -88,7 +106,13 @@ class GridRun(Run):
             (n for n, v in grid.point_data.items() if field_name(n) in DISPLACEMENT_NAMES and v.shape[1:] == (3,)), None
         )
         if name is None:
-            if last and not moving:
+            if not last:
+                raise ReadError(
+                    f"{source.place(0)}: is the only state of the run and has no point array called displacement, so "
+                    "nothing says what moved; expected the undeformed state as well, or the displacement "
+                    f"(3 components); found {', '.join(grid.point_data) or 'no arrays'}"
+                )
+            if not moving:
                 raise ReadError(
                     f"{source.place(last)}: its points stand where they stood in the first state, and there is no point "
                     f"array called displacement (3 components); found {', '.join(grid.point_data) or 'no arrays'}"
@@ -100,7 +124,7 @@ class GridRun(Run):
         if not moving:
             return _Reading(name, False, False), start, []
         reference = start - first
-        told = np.asarray(source.array("point", name, last), np.float64)
+        told = np.asarray(self._array("point", name, last), np.float64)
         size = float(np.ptp(start, axis=0).max())
         difference = float(np.nanmax(np.abs(np.asarray(ends, np.float64) - reference - told), initial=0.0))
         if difference > _AGREE * size:
@@ -113,8 +137,8 @@ class GridRun(Run):
 
     def _read_mesh(self, grid: Grid, reference: NDArray[np.float64]) -> RunMesh:
         count = len(grid.points)
-        node_id = _ids(grid.point_data, _NODE_IDS, count)
-        element_id = _ids(grid.cell_data, _ELEMENT_IDS, len(grid.types))
+        node_id = _ids(grid.point_data, NODE_IDS, count)
+        element_id = _ids(grid.cell_data, ELEMENT_IDS, len(grid.types))
         owner, parts = _parts(grid, node_id, element_id)
         return RunMesh(
             position=reference,
@@ -211,7 +235,10 @@ class GridRun(Run):
 
     def _array(self, kind: Place, name: str, state: int) -> NDArray[Any]:
         with reading(self._source.place(state)):
-            found = self._source.array(kind, name, state)
+            if kind == "point" and name in self._joined:
+                found = np.stack([self._source.array(kind, title, state) for title in self._joined[name]], axis=1)
+            else:
+                found = self._source.array(kind, name, state)
         if found.shape != self._shapes[kind, name]:
             raise ReadError(
                 f"{self._source.place(state)}: {kind} array {name!r} has shape {found.shape}, "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 # What a field measures, for the change to SI. A name that is not here keeps its own name as its quantity, so that its
 # values stay as they are, labelled "unknown". Temperature is left out on purpose: no source says whether it is in
@@ -58,6 +59,21 @@ _SAME = {
 }
 # A part so called is a rigid wall drawn for the eye, where nothing better tells it.
 WALL_NAME = re.compile(r"\brigid.?wall|\brwall", re.IGNORECASE)
+# LS-DYNA's own name for the shells it draws a wall with; they are of a null material, not of a rigid one.
+DRAWN_WALL = re.compile(r"\bnull shells? for visuali[sz]ation", re.IGNORECASE)
+# Numbers of nodes and elements, in lower case, as solvers, their converters and VTK call them.
+NODE_IDS = (
+    "node_id", "node_ids", "globalnodeid", "globalnodeids", "globalpointid", "globalpointids", "globalids",
+    "global_ids", "vtkglobalids",
+)  # fmt: skip
+ELEMENT_IDS = (
+    "element_id", "element_ids", "globalelementid", "globalelementids", "globalcellid", "globalcellids", "globalids",
+    "global_ids", "vtkglobalids", "face_id",
+)  # fmt: skip
+# A name that ends in x, y or z: UX, displ_x, "velocity:z".
+_AXIS = re.compile(r"(?P<name>.+?)[ _.:-]?(?P<axis>[xyz])", re.IGNORECASE)
+# Displacements are also numbered by their axes: U1, U2, U3, or "displacement:0" and so on.
+_NUMBERED_AXIS = re.compile(r"(?P<name>.+?)[ _.:-]?(?P<axis>[0123])")
 DISPLACEMENT_NAMES = ("displacement", "displacements", "displ", "disp", "u")
 
 
@@ -84,3 +100,18 @@ def quantity(name: str) -> str:
         if words[end - 1] in _CHANGING:
             break
     return name
+
+
+def vectors_among(titles: Sequence[str]) -> dict[str, tuple[str, str, str]]:
+    """Vectors that are kept as three scalars: name -> titles of x, y and z."""
+    out = {}
+    for pattern, axes in ((_AXIS, ("xyz",)), (_NUMBERED_AXIS, ("123", "012"))):
+        found: dict[str, dict[str, str]] = {}
+        for title in titles:
+            if match := pattern.fullmatch(title):
+                found.setdefault(match["name"], {})[match["axis"].lower()] = title
+        for name, by_axis in found.items():
+            whole = next((order for order in axes if set(by_axis) == set(order)), None)
+            if whole and (pattern is _AXIS or field_name(name) in DISPLACEMENT_NAMES):
+                out[name] = (by_axis[whole[0]], by_axis[whole[1]], by_axis[whole[2]])
+    return out

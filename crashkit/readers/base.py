@@ -11,6 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal, Protocol
 
 import numpy as np
@@ -90,6 +91,8 @@ class Run(ABC):
     end_time    the end time the control data asks for, None where the source does not say
     left_out    what the source holds and this reader does not give, by name
     problems    reasons why the run is incomplete or damaged though it can be opened; ingest refuses such runs
+    notes       what a user should know though nothing is wrong, such as states that were listed twice
+    withheld    fields that are in the files and not offered: name -> why, and what to do
     """
 
     name: str
@@ -103,6 +106,8 @@ class Run(ABC):
     end_time: float | None = None
     left_out: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    withheld: Mapping[str, str] = MappingProxyType({})
 
     @abstractmethod
     def displacement(self, first: int, last: int) -> NDArray[np.float32]:
@@ -134,12 +139,14 @@ class Run(ABC):
 class Runs(Iterator[Run]):
     """Runs of one source, by name; each is opened only when its turn comes or when it is asked for.
 
-    One that cannot be opened raises ReadError, and the iteration goes on behind it.
+    One that cannot be opened raises ReadError, and the iteration goes on behind it. `passed_over` says in words what
+    the source holds beside them.
     """
 
-    def __init__(self, openers: Mapping[str, Callable[[], Run]]) -> None:
+    def __init__(self, openers: Mapping[str, Callable[[], Run]], passed_over: Sequence[str] = ()) -> None:
         self._openers = dict(openers)
         self._left = iter(self._openers)
+        self.passed_over = tuple(passed_over)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -8,7 +8,12 @@ stand alone (`plastic_strain`, `velocity`); those of cells carry their kind in f
 an element has several integration points, `plastic_strain` and `von_mises` are the largest of them and `stress` and
 `strain` their mean (xx, yy, zz, xy, yz, zx). Shells of rigid parts have no results; their fields are NaN.
 
-A part is taken for a rigid wall if it is called so and, where the file tells materials, is rigid (material 20).
+A part is taken for a rigid wall if it is called so and, where the file tells materials, is rigid (material 20), or if
+LS-DYNA drew it with "null shells for visualization". Titles of parts come with numbers: those of the parts up to
+release 11, and 1, 2, 3, ... in the order of the parts since release 12.
+
+In a folder with a d3plot, other families of LS-DYNA (d3part, d3drlf, ...) are left aside; where they are all there is,
+they are read.
 
 A d3plot does not know its end time; it is taken from *CONTROL_TERMINATION of a keyword file in the same folder.
 """
@@ -30,12 +35,15 @@ from crashkit.readers._binout import binout_files, read_binout
 from crashkit.readers._cells import LINE, VERTEX, shell_faces, solid_cells, stack_cells
 from crashkit.readers._checks import require_finite, require_indices, require_options, time_problems
 from crashkit.readers._d3plot_file import D3plotFile, word_size
-from crashkit.readers._folders import runs_in
-from crashkit.readers._names import WALL_NAME, quantity
+from crashkit.readers._folders import Collected, files_in, named, recognises, runs_in
+from crashkit.readers._names import DRAWN_WALL, WALL_NAME, quantity
 from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh, Runs
 from crashkit.readers.history import History
 
 _RIGID = 20
+# How first files are called, with a job's name in front where it has one; the second are those beside a d3plot.
+_ENDING = re.compile(r"d3(plot|part)$", re.IGNORECASE)
+_BESIDE = re.compile(r"d3(part|drlf|eigv|mode|iter)$", re.IGNORECASE)
 _DECK_SUFFIXES = (".k", ".key", ".dyn")
 _DECK_BYTES = 16 << 20
 # (kind, field, lasso-python's name, components); what stands in a file is told by its header.
@@ -53,7 +61,20 @@ _ELEMENT_FIELDS = (
     ("shell", "plastic_strain", "element_shell_effective_plastic_strain", 1),
     ("shell", "strain", "element_shell_strain", 6),
     ("shell", "thickness", "element_shell_thickness", 1),
+    ("sph", "radius", "sph_radius", 1),
+    ("sph", "pressure", "sph_pressure", 1),
+    ("sph", "stress", "sph_stress", 6),
+    ("sph", "von_mises", "sph_stress", 1),
+    ("sph", "plastic_strain", "sph_effective_plastic_strain", 1),
+    ("sph", "density", "sph_density", 1),
+    ("sph", "internal_energy", "sph_internal_energy", 1),
+    ("sph", "neighbors", "sph_n_neighbors", 1),
+    ("sph", "strain", "sph_strain", 6),
+    ("sph", "strain_rate", "sph_strainrate", 6),
+    ("sph", "mass", "sph_mass", 1),
 )
+# Dimensions of these fields where elements have no integration points.
+_WITHOUT_POINTS = {"plastic_strain": 1, "stress": 2, "von_mises": 2, "strain": 2, "strain_rate": 2}
 _CELL_KINDS = ("solid", "tshell", "beam", "sph")
 
 
@@ -64,36 +85,43 @@ class D3plot:
     description = "LS-DYNA d3plot, d3plot01, ... (through lasso-python)"
 
     def sniff(self, path: Path) -> bool:
-        try:
-            return bool(_first_files(path))
-        except OSError:
-            return False
+        return recognises(_found, path)
 
     def runs(self, path: Path, **options: object) -> Runs:
         require_options(self.name, options)
-        found = _first_files(path) or ({path.name: path} if path.is_file() else {})
+        found = _found(path) or Collected({path.name: path} if path.is_file() else {})
         if not found:
             raise ReadError(f"{path}: no d3plot here; expected files d3plot, d3plot01, ...")
-        return Runs({name: partial(_D3plotRun, name, file) for name, file in found.items()})
+        return Runs({name: partial(_D3plotRun, name, file) for name, file in found.runs.items()}, found.aside)
 
 
-def _first_files(path: Path) -> dict[str, Path]:
+def _found(path: Path) -> Collected[Path]:
     """Run name -> first file of all families at `path`."""
     if path.is_file():
         if word_size(path) is None:
-            return {}
-        alone = len(_first_files_in(path.parent)) <= 1
-        return {path.resolve().parent.name if alone else path.name: path}
-    if not path.is_dir():
-        return {}
-    return runs_in(path, lambda folder: {file.name: file for file in _first_files_in(folder)})
+            return Collected()
+        main, beside = _first_files_in(path.parent)
+        alike = beside if path in beside else main
+        return Collected({path.resolve().parent.name if len(alike) <= 1 else path.name: path})
+    return runs_in(path, _found_in) if path.is_dir() else Collected()
 
 
-def _first_files_in(folder: Path) -> list[Path]:
-    files = sorted(p for p in folder.iterdir() if p.is_file())
+def _found_in(folder: Path) -> Collected[Path]:
+    main, beside = _first_files_in(folder)
+    aside = []
+    if main and beside:
+        names = ", ".join(p.name for p in beside)
+        aside.append(f"{folder}: {names} left aside, since {main[0].name} is there; name the file to read it")
+    return Collected(named((p.name, p.name, p) for p in main or beside), aside)
+
+
+def _first_files_in(folder: Path) -> tuple[list[Path], list[Path]]:
+    """First files of the families with whole results, and of those with parts of them (d3part, d3drlf, ...)."""
+    files = list(files_in(folder))
     names = {p.name for p in files}
-    likely = [p for p in files if p.name.lower().endswith("d3plot") or f"{p.name}01" in names]
-    return [p for p in likely if word_size(p) is not None]
+    likely = [p for p in files if _ENDING.search(p.name) or f"{p.name}01" in names]
+    good = [p for p in likely if word_size(p) is not None]
+    return [p for p in good if not _BESIDE.search(p.name)], [p for p in good if _BESIDE.search(p.name)]
 
 
 class _D3plotRun(Run):
@@ -195,13 +223,19 @@ class _D3plotRun(Run):
             ids = self._array("part_ids", count)
         else:
             ids = titled if len(titled) == count else np.arange(1, count + 1)
-        titles = dict(zip(titled.tolist(), self._arrays.get("part_titles", ()), strict=True))
+        texts = [bytes(t).split(b"\0")[0].decode("latin-1").strip() for t in self._arrays.get("part_titles", ())]
+        counted = np.array_equal(titled, np.arange(1, count + 1))
+        if len(titled) == count and (counted or set(titled.tolist()) != set(ids.tolist())):
+            titles = dict(zip(ids.tolist(), texts, strict=True))
+        else:
+            titles = dict(zip(titled.tolist(), texts, strict=True))
         materials = np.asarray(self._arrays.get("part_material_type", []), np.int64)
         parts = []
         for k, number in enumerate(ids.tolist()):
-            name = bytes(titles.get(number, b"")).split(b"\0")[0].decode("latin-1").strip() or f"part {number}"
+            name = titles.get(number) or f"part {number}"
             rigid = len(materials) != count or materials[k] == _RIGID
-            parts.append(Part(number, name, rigid and WALL_NAME.search(name) is not None))
+            wall = bool(DRAWN_WALL.search(name) or (rigid and WALL_NAME.search(name)))
+            parts.append(Part(number, name, wall))
         return tuple(parts)
 
     def _told_positions(self) -> bool:
@@ -236,15 +270,25 @@ class _D3plotRun(Run):
             "axial_force": {"default": header.n_beam_vars >= 6},
             "shear_force": {"default": header.n_beam_vars >= 6},
         }
-        for kind, plain, _, components in _ELEMENT_FIELDS:
-            there = told["stress" if plain == "von_mises" else plain]
-            if blocks[kind][1] and there.get(kind, there["default"]):
+        withheld = {}
+        for kind, plain, theirs, components in _ELEMENT_FIELDS:
+            if kind == "sph":
+                there = self._file.particle_fields.get(theirs, False)
+            else:
+                flags = told["stress" if plain == "von_mises" else plain]
+                there = flags.get(kind, flags["default"])
+            if kind == "shell" and there and plain in self._file.shells_withheld:
+                withheld[plain] = self._file.shells_withheld[plain]
+            elif blocks[kind][1] and there:
                 name = plain if kind == "shell" else f"{kind}_{plain}"
                 place = "face" if kind == "shell" else "cell"
                 fields[name] = FieldInfo(name, place, components, quantity(plain))  # type: ignore[arg-type]
+        self.withheld = withheld
         return fields
 
     def field(self, name: str, first: int, last: int) -> NDArray[np.float32]:
+        if name in self.withheld:
+            raise ReadError(f"{self._file.first}: {name} is not read: {self.withheld[name]}")
         info = self.fields[name]
         if info.location == "node":
             values = np.stack([self._file.block(name, s) for s in range(first, last)]).astype(np.float32)
@@ -295,36 +339,45 @@ class _D3plotRun(Run):
     def _living(
         self, kinds: tuple[str, ...], nodes: NDArray[np.int32], first: int, last: int
     ) -> NDArray[np.bool_] | None:
-        """(state, element): element words other than zero; or, where nodes are told, elements with all their nodes."""
+        """(state, element): element words other than zero; or, where nodes are told, elements with all their nodes.
+
+        Particles have a word of their own (`D3plotFile.particle_alive`).
+        """
         blocks = self._file.blocks
         if not len(nodes):
             return None
-        if "node_alive" in blocks:
-            there = np.stack([np.append(self._file.block("node_alive", s) != 0, True) for s in range(first, last)])
-            return np.asarray(there[:, nodes].all(axis=2))  # node -1 of the padding is the True appended
-        if not any(f"{kind}_alive" in blocks for kind in kinds):
+        particles = "sph" in kinds and blocks["sph"][1] > 0
+        if not particles and not any(f"{kind}_alive" in blocks for kind in ("node", *kinds)):
             return None
         rows = []
         for state in range(first, last):
-            told = [
-                self._file.block(f"{kind}_alive", state) != 0
-                if f"{kind}_alive" in blocks
-                else np.ones(self._counts[kind], bool)
-                for kind in kinds
-            ]
+            told = [self._elements_alive(kind, state) for kind in kinds]
             rows.append(np.concatenate(told))
+            if "node_alive" in blocks:
+                there = np.append(self._file.block("node_alive", state) != 0, True)
+                rows[-1] &= there[nodes].all(axis=1)  # node -1 of the padding is the True appended
         return np.stack(rows)
+
+    def _elements_alive(self, kind: str, state: int) -> NDArray[np.bool_]:
+        """(element,) of one kind; all where the state does not say."""
+        if kind == "sph" and self._file.blocks["sph"][1]:
+            return self._file.particle_alive(state)
+        if f"{kind}_alive" in self._file.blocks:
+            return np.asarray(self._file.block(f"{kind}_alive", state) != 0)
+        return np.ones(self._counts.get(kind, len(self.mesh.face_nodes)), bool)
 
 
 def _one_value(plain: str, values: NDArray[Any]) -> NDArray[Any]:
     """One value an element from its integration points: (element, point[, component]) -> (element[, component])."""
+    if values.ndim == _WITHOUT_POINTS.get(plain):  # particles have none
+        values = values[:, None]
     if plain == "von_mises":
         xx, yy, zz, xy, yz, zx = np.moveaxis(values.astype(np.float64), -1, 0)
         squared = ((xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2) / 2 + 3 * (xy**2 + yz**2 + zx**2)
         return np.sqrt(squared).max(axis=1)
     if plain == "plastic_strain":
         return values.max(axis=1)
-    if plain in ("stress", "strain"):
+    if plain in ("stress", "strain", "strain_rate"):
         return values.mean(axis=1, dtype=np.float64)
     return values
 
@@ -332,8 +385,15 @@ def _one_value(plain: str, values: NDArray[Any]) -> NDArray[Any]:
 def _family(first: Path) -> dict[int, Path]:
     """Number -> file of the family behind its first file, in the order of their numbers."""
     name = re.compile(re.escape(first.name) + r"(\d+)")
-    files = sorted(p for p in first.parent.iterdir() if p.is_file())
-    found = {int(m[1]): file for file in files if (m := name.fullmatch(file.name))}
+    found: dict[int, Path] = {}
+    for file in files_in(first.parent):
+        if match := name.fullmatch(file.name):
+            other = found.setdefault(int(match[1]), file)
+            if other != file:
+                raise ReadError(
+                    f"{first.parent}: {other.name} and {file.name} have the same number; expected one file each, so "
+                    "rename or remove one of them"
+                )
     return dict(sorted(found.items()))
 
 

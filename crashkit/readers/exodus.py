@@ -1,5 +1,8 @@
 """Exodus II files (.exo, .e, .g) with time, as classic NetCDF or HDF5.
 
+A run that was computed on several processors lies in pieces, out.e.4.0 to out.e.4.3, which are joined by their maps
+of node and element numbers. Where the mesh was refined on the way (out.e, out.e-s002, ...) the run is refused.
+
 Coordinates are undeformed; the nodal variables DISPLX, DISPLY, DISPLZ (or displ_x, disp_x, ...) move them. Element
 blocks become parts. An element variable is NaN in blocks that do not have it; `status` is 1 for living elements.
 
@@ -12,6 +15,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,18 +26,24 @@ from numpy.typing import NDArray
 from crashkit.errors import ReadError
 from crashkit.readers import register
 from crashkit.readers._checks import LIBRARY_ERRORS, reading, require_options
-from crashkit.readers._folders import runs_in
+from crashkit.readers._folders import Collected, files_in, named, recognises, runs_in
 from crashkit.readers._grid import Grid, GridSource, Place
 from crashkit.readers._grid_run import GridRun
+from crashkit.readers._hdf5_data import files_behind
+from crashkit.readers._names import vectors_among
 from crashkit.readers.base import Run, Runs
 
+# Zeros behind a classic file up to this many are padding.
+_PADDING = 1 << 20
 _CLASSIC, _HDF5 = (b"CDF\x01", b"CDF\x02"), b"\x89HDF\r\n\x1a\n"
 # Beginning of an element type's name -> corners, VTK type. Nodes behind the corners are in the middle of edges.
 _SHAPES = {
     "TRI": (3, 5), "QUAD": (4, 9), "SHELL": (4, 9), "TET": (4, 10), "HEX": (8, 12), "WEDGE": (6, 13), "PYR": (5, 14),
     "BAR": (2, 3), "BEAM": (2, 3), "TRUSS": (2, 3), "ROD": (2, 3), "EDGE": (2, 3), "SPHERE": (1, 1), "CIRCLE": (1, 1),
 }  # fmt: skip
-_VECTOR = re.compile(r"(?P<name>.+?)_?(?P<axis>[xyz])", re.IGNORECASE)
+# Of a run in pieces: name of the whole, number of pieces, number of the piece. Of a refined mesh: the file before it.
+_PIECE = re.compile(r"(?P<whole>.+)\.(?P<count>\d+)\.(?P<number>\d+)")
+_REFINED = re.compile(r"(?P<first>.+)-s\d+")
 
 
 class Exodus:
@@ -43,32 +53,67 @@ class Exodus:
     description = "Exodus II with time (classic NetCDF or HDF5)"
 
     def sniff(self, path: Path) -> bool:
-        try:
-            return bool(_files(path))
-        except OSError:
-            return False
+        return recognises(_found, path)
 
     def runs(self, path: Path, **options: object) -> Runs:
         require_options(self.name, options)
-        files = _files(path) or ({path.stem: path} if path.is_file() else {})
-        if not files:
+        found = _found(path) or Collected({path.stem: [path]} if path.is_file() else {})
+        if not found:
             raise ReadError(f"{path}: no Exodus file here")
-        return Runs({name: partial(_open, name, file) for name, file in files.items()})
+        return Runs({name: partial(_open, name, files) for name, files in found.runs.items()}, found.aside)
 
 
-def _files(path: Path) -> dict[str, Path]:
+def _found(path: Path) -> Collected[list[Path]]:
+    """Run name -> its file, or its pieces."""
     if path.is_file():
-        return {path.stem: path} if _is_exodus(path) else {}
-    if not path.is_dir():
-        return {}
-    return _files_in(path) or runs_in(path, _files_in)
+        if not _is_exodus(path):
+            return Collected()
+        piece = _PIECE.fullmatch(path.name)
+        names = [p.name for p in files_in(path.parent)] if piece else []
+        family = [path.parent / n for n in names if (m := _PIECE.fullmatch(n)) and piece and _same_family(m, piece)]
+        return Collected({_stem(path): family or [path]})
+    return runs_in(path, _found_in, own_name_at_top=True) if path.is_dir() else Collected()
 
 
-def _files_in(folder: Path) -> dict[str, Path]:
-    return {p.stem: p for p in sorted(folder.iterdir()) if p.is_file() and _is_exodus(p)}
+def _found_in(folder: Path) -> Collected[list[Path]]:
+    files = [p for p in files_in(folder) if _is_exodus(p)]
+    aside = []
+    families: dict[tuple[str, str], list[Path]] = {}
+    for file in files:
+        piece = _PIECE.fullmatch(file.name)
+        families.setdefault((piece["whole"], piece["count"]) if piece else (file.name, ""), []).append(file)
+    for whole, count in list(families):
+        if count and (whole, "") in families:
+            aside.append(f"{folder}: the pieces {whole}.{count}.* are left aside, since {whole} is there")
+            del families[whole, count]
+    # A mesh from before the run stands beside its results; alone, it is to be refused as what it is.
+    meshes = [key for key, pieces in families.items() if len(families) > 1 and not _has_states(pieces[0])]
+    if len(meshes) < len(families):
+        for whole, count in meshes:
+            aside.append(f"{folder}: {whole} is left aside, it is a mesh without states")
+            del families[whole, count]
+    listed = ((_stem(pieces[0]), whole, pieces) for (whole, _), pieces in families.items())
+    return Collected(named(entry for entry in listed if not _is_continued(entry[2][0], files)), aside)
+
+
+def _stem(file: Path) -> str:
+    piece = _PIECE.fullmatch(file.name)
+    return Path(piece["whole"]).stem if piece else file.stem
+
+
+def _same_family(one: re.Match[str], other: re.Match[str]) -> bool:
+    return (one["whole"], one["count"]) == (other["whole"], other["count"])
+
+
+def _is_continued(file: Path, files: list[Path]) -> bool:
+    """Whether a file goes on with another one after the mesh was refined (out.e-s002 with out.e)."""
+    later = _REFINED.fullmatch(file.name)
+    return later is not None and any(other.name == later["first"] for other in files)
 
 
 def _is_exodus(file: Path) -> bool:
+    if not file.is_file():
+        return False
     with file.open("rb") as stream:
         start = stream.read(8)
         if start[:4] in _CLASSIC:
@@ -85,22 +130,47 @@ def _is_exodus(file: Path) -> bool:
         return False
 
 
-def _open(name: str, file: Path) -> Run:
+def _has_states(file: Path) -> bool:
+    try:
+        with reading(file), closing(_opened(file)) as opened:
+            return _count(opened, "time_whole") > 0
+    except ReadError:
+        return True  # what is damaged is to be named as that
+
+
+def _count(opened: Any, name: str) -> int:
+    """Length of a variable, 0 where there is none; SciPy can close its file only once nobody holds a variable."""
+    variables = getattr(opened, "variables", opened)
+    return int(variables[name].shape[0]) if name in variables else 0
+
+
+def _open(name: str, files: list[Path]) -> Run:
+    file = files[0]
+    refined = [p for p in files_in(file.parent) if (m := _REFINED.fullmatch(p.name)) and m["first"] == file.name]
+    if refined:
+        raise ReadError(
+            f"{file}: goes on in {refined[0].name}, so the mesh changes during the run, which is not supported; compute "
+            "it on one mesh (no adaptivity)"
+        )
     with reading(file):
-        return GridRun(name, _Blocks(file))
+        return GridRun(name, _Pieces(files) if _PIECE.fullmatch(file.name) else _Blocks(file))
 
 
 class _Blocks(GridSource):
     """The variables of one file."""
 
     def __init__(self, file: Path) -> None:
-        self.file, self.files = file, (file,)
+        self.file = file
         self._opened = _opened(file)
+        self._behind: dict[str, set[Path]] = {}
         self.time = np.asarray(self._take("time_whole", ...), np.float64).reshape(-1)
         self._points = self._coordinates()
         self._read_blocks()
         self._nodal = _grouped(self._texts("name_nod_var"))
         self._element = _grouped(self._texts("name_elem_var"))
+        for column in (c for columns in self._nodal.values() for c in columns):
+            self._require_present(f"vals_nod_var{column + 1}")
+        self.files = (file, *sorted(set().union(*self._behind.values())))
         self.problems = self._unread()
 
     def place(self, state: int) -> str:
@@ -115,16 +185,28 @@ class _Blocks(GridSource):
     def _take(self, name: str, index: Any) -> NDArray[Any]:
         if name not in self._variables:
             raise ReadError(f"{self.file}: has no variable {name}; it is damaged or holds no states")
+        self._require_present(name)
         with reading(f"{self.file}, {name}"):
             return np.array(self._variables[name][index])
+
+    def _require_present(self, name: str) -> None:
+        if name in self._variables and name not in self._behind:
+            variable = self._variables[name]
+            self._behind[name] = files_behind(variable, self.file) if hasattr(variable, "is_virtual") else set()
 
     def _unread(self) -> tuple[str, ...]:
         """A problem where a classic file goes on behind its last variable: then it holds more states than it says."""
         if not hasattr(self._opened, "variables"):  # HDF5 knows where it ends
             return ()
         end = max(_end(variable.data) for variable in self._variables.values())
-        behind = self.file.stat().st_size - end
-        return (f"{self.file}: {behind} bytes behind its last variable, at byte {end}; damaged",) if behind > 3 else ()
+        with self.file.open("rb") as stream:
+            stream.seek(end)
+            behind = stream.read(_PADDING + 1)
+        # Some programs fill the file up to a block of the disk: zeros alone are no states.
+        if len(behind) <= 3 or (len(behind) <= _PADDING and not behind.strip(b"\0")):
+            return ()
+        size = self.file.stat().st_size - end
+        return (f"{self.file}: {size} bytes behind its last variable, at byte {end}; damaged",)
 
     def _texts(self, name: str) -> list[str]:
         if name not in self._variables:
@@ -203,15 +285,84 @@ class _Blocks(GridSource):
         self._opened.close()
 
 
+class _Pieces(GridSource):
+    """A run in pieces, one file a processor: every node and element once, told by their numbers."""
+
+    def __init__(self, files: list[Path]) -> None:
+        found = {int(m["number"]): file for file in files if (m := _PIECE.fullmatch(file.name))}
+        match = _PIECE.fullmatch(files[0].name)
+        count = int(match["count"]) if match else 0
+        missing = sorted(set(range(count)) - set(found))
+        if missing or len(found) != len(files):
+            raise ReadError(
+                f"{files[0]}: of its {count} pieces number {missing[0] if missing else count} is missing; join the whole "
+                "run with epu, or copy all pieces"
+            )
+        self._pieces = [_Blocks(found[k]) for k in sorted(found)]
+        self.files = tuple(f for piece in self._pieces for f in piece.files)
+        self.problems = tuple(p for piece in self._pieces for p in piece.problems)
+        self.time = self._pieces[0].time
+        self._grids = [piece.first() for piece in self._pieces]
+        for piece, grid in zip(self._pieces, self._grids, strict=True):
+            if not np.array_equal(piece.time, self.time):
+                raise ReadError(f"{piece.file}: has other times than {self._pieces[0].file.name}; join them with epu")
+            if "node_id" not in grid.point_data or "element_id" not in grid.cell_data:
+                raise ReadError(
+                    f"{piece.file}: is piece of a run and has no node_num_map or elem_num_map; join the pieces with epu"
+                )
+        ids = np.concatenate([g.point_data["node_id"] for g in self._grids])
+        self._node_id, self._first, inverse = np.unique(ids, return_index=True, return_inverse=True)
+        self._inverse = inverse.reshape(-1)
+        points = np.concatenate([g.points for g in self._grids])
+        self._points = points[self._first]
+        if not np.array_equal(self._points[self._inverse], points):
+            raise ReadError(f"{files[0]}: its pieces have nodes of one number in different places; join them with epu")
+
+    def place(self, state: int) -> str:
+        return f"{self.files[0]} and its pieces, state {state}"
+
+    def first(self) -> Grid:
+        grids = self._grids
+        nodes = np.cumsum([0, *(len(g.points) for g in grids)])
+        corners = np.cumsum([0, *(len(g.connectivity) for g in grids)])
+        joined = np.concatenate([g.connectivity + start for g, start in zip(grids, nodes)])
+        points = {n: self.array("point", n, 0) for n in self._common("point")}
+        cells = {n: np.concatenate([g.cell_data[n] for g in grids]) for n in self._common("cell")}
+        names = {number: name for g in grids for number, name in g.part_names.items()}
+        return Grid(
+            self._points,
+            self._inverse[joined],
+            np.concatenate([[0], *(g.offsets[1:] + start for g, start in zip(grids, corners))]),
+            np.concatenate([g.types for g in grids]),
+            {**points, "node_id": self._node_id},
+            cells,
+            part_names=names,
+        )
+
+    def _common(self, kind: Place) -> list[str]:
+        """Names of the arrays that all pieces have, without the numbers of nodes."""
+        arrays = [g.point_data if kind == "point" else g.cell_data for g in self._grids]
+        return [n for n in arrays[0] if n != "node_id" and all(n in a for a in arrays)]
+
+    def points(self, state: int) -> NDArray[np.floating]:
+        return self._points
+
+    def array(self, kind: Place, name: str, state: int) -> NDArray[Any]:
+        values = np.concatenate([piece.array(kind, name, state) for piece in self._pieces])
+        return values[self._first] if kind == "point" else values
+
+    def close(self) -> None:
+        for piece in self._pieces:
+            piece.close()
+
+
 def _grouped(names: list[str]) -> dict[str, tuple[int, ...]]:
     """Variables by name; three that end in x, y and z are one vector."""
-    axes: dict[str, dict[str, int]] = {}
-    for k, name in enumerate(names):
-        if match := _VECTOR.fullmatch(name):
-            axes.setdefault(match["name"], {})[match["axis"].lower()] = k
-    vectors = {name: tuple(found[a] for a in "xyz") for name, found in axes.items() if len(found) == 3}
-    taken = {k for columns in vectors.values() for k in columns}
-    return {**vectors, **{name: (k,) for k, name in enumerate(names) if k not in taken}}
+    vectors = vectors_among(names)
+    place = {name: k for k, name in enumerate(names)}
+    taken = {title for titles in vectors.values() for title in titles}
+    whole = {name: tuple(place[title] for title in titles) for name, titles in vectors.items()}
+    return {**whole, **{name: (k,) for k, name in enumerate(names) if name not in taken}}
 
 
 def _opened(file: Path) -> Any:

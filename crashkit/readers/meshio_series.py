@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from crashkit.errors import CrashkitError, ReadError
 from crashkit.extras import need
 from crashkit.readers import register
-from crashkit.readers._checks import reading, require_options
-from crashkit.readers._folders import runs_in
+from crashkit.readers._checks import reading, require_options, time_step_option
+from crashkit.readers._folders import Collected, files_in, named, one_file_each, recognises
 from crashkit.readers._grid import Grid, WholeStates
 from crashkit.readers._grid_run import GridRun
+from crashkit.readers._hdf5_data import files_behind
 from crashkit.readers.base import Run, Runs
 
 _XDMF = re.compile(rb"<Xdmf[\s>]")
@@ -42,61 +43,58 @@ class MeshioSeries:
     description = "XDMF time series, and (asked for by name) numbered files of any format meshio reads"
 
     def sniff(self, path: Path) -> bool:
-        try:
-            return bool(_xdmf_files(path))
-        except OSError:
-            return False
+        return recognises(_xdmf_files, path)
 
     def runs(self, path: Path, **options: object) -> Runs:
         require_options(self.name, options, ("time_step",))
+        step = time_step_option(options)
         found = _xdmf_files(path)
         if found:
-            return Runs({name: partial(_open_xdmf, name, file) for name, file in found.items()})
-        step = options.get("time_step")
+            return Runs({name: partial(_open_xdmf, name, file, step) for name, file in found.runs.items()}, found.aside)
         families = _numbered(path)
         if not families:
             raise ReadError(f"{path}: no XDMF file, and no files that differ by a number in their name")
-        try:
-            time_step = float(str(step))
-        except ValueError:
-            raise CrashkitError(
-                f"{path}: its files hold no times; give the time between two of them (--time-step), found {step!r}"
-            ) from None
-        return Runs({name: partial(_open_files, name, files, time_step) for name, files in families.items()})
+        if step is None:
+            raise CrashkitError(f"{path}: its files hold no times; give the time between two of them (--time-step)")
+        return Runs({name: partial(_open_files, name, files, step) for name, files in families.items()})
 
 
-def _xdmf_files(path: Path) -> dict[str, Path]:
-    if path.is_file():
-        return {path.stem: path} if _is_xdmf(path) else {}
-    if not path.is_dir():
-        return {}
-    return _xdmf_in(path) or runs_in(path, _xdmf_in)
-
-
-def _xdmf_in(folder: Path) -> dict[str, Path]:
-    return {p.stem: p for p in sorted(folder.iterdir()) if p.is_file() and _is_xdmf(p)}
+def _xdmf_files(path: Path) -> Collected[Path]:
+    return one_file_each(path, _is_xdmf)
 
 
 def _is_xdmf(file: Path) -> bool:
+    if not file.is_file():
+        return False
     with file.open("rb") as stream:
         return _XDMF.search(stream.read(4096)) is not None
 
 
 def _numbered(path: Path) -> dict[str, list[Path]]:
+    """Families of at least two files that differ by a number, in the order of their numbers."""
     folder = path if path.is_dir() else path.parent
-    families: dict[str, dict[int, Path]] = {}
-    for file in sorted(folder.iterdir()):
+    families: dict[tuple[str, str], dict[int, Path]] = {}
+    for file in files_in(folder):
         match = _NUMBERED.fullmatch(file.stem)
-        if match and file.is_file() and (path.is_dir() or file.suffix == path.suffix):
-            name = match["stem"] or folder.resolve().name
-            families.setdefault(f"{name}{file.suffix}", {})[int(match["number"])] = file
-    listed = {name: [files[n] for n in sorted(files)] for name, files in families.items() if len(files) > 1}
-    return {Path(name).stem: files for name, files in listed.items() if path.is_dir() or path in files}
+        if match and (path.is_dir() or file.suffix == path.suffix):
+            states = families.setdefault((match["stem"] or folder.resolve().name, file.suffix), {})
+            other = states.setdefault(int(match["number"]), file)
+            if other != file:
+                raise ReadError(
+                    f"{folder}: {other.name} and {file.name} have the same number; expected one file a state, so rename "
+                    "or remove one of them"
+                )
+    listed = [(*key, [files[n] for n in sorted(files)]) for key, files in families.items() if len(files) > 1]
+    found = named((stem, stem + suffix, files) for stem, suffix, files in listed)
+    return {name: files for name, files in found.items() if path.is_dir() or path in files}
 
 
-def _open_xdmf(name: str, file: Path) -> Run:
+def _open_xdmf(name: str, file: Path, step: float | None) -> Run:
     with reading(file):
-        return GridRun(name, _Xdmf(file))
+        source = _Xdmf(file, step)
+        run = GridRun(name, source)
+        run.notes = (*source.notes, *run.notes)
+        return run
 
 
 def _open_files(name: str, files: list[Path], step: float) -> Run:
@@ -135,25 +133,65 @@ def _grid(
 class _Xdmf(WholeStates):
     """The states of an XDMF file, through meshio."""
 
-    def __init__(self, file: Path) -> None:
+    def __init__(self, file: Path, step: float | None) -> None:
         need(f"reading {file}", "formats")
         from meshio.xdmf import TimeSeriesReader
 
         self.file = file
+        self.notes: tuple[str, ...] = ()
         try:
             self._reader = TimeSeriesReader(file)
-            times = [step.find("Time") for step in self._reader.collection]
-            self.time = np.array([float(t.attrib["Value"]) for t in times if t is not None], np.float64)
+            times = [grid.find("Time") for grid in self._reader.collection]
+            own = [float(t.attrib["Value"]) for t in times if t is not None]
         except Exception as error:  # meshio raises whatever its parsing meets, often without a text
             raise ReadError(
-                f"{file}: not readable as an XDMF time series ({_text(error)}); it is damaged or has no time"
+                f"{file}: not readable as an XDMF time series ({_text(error)}); it is damaged, holds one state only, or "
+                "is no XDMF of version 3"
             ) from error
-        if len(self.time) != len(self._reader.collection):
-            raise ReadError(f"{file}: {len(self._reader.collection) - len(self.time)} of its states have no time")
+        _refuse_checkpoint(file, self._reader.domain)
+        count = len(times)
+        if own and len(own) < count:
+            raise ReadError(f"{file}: {count - len(own)} of its states have no time; expected all or none")
+        if not own and step is None:
+            raise ReadError(f"{file}: its {count} states have no time; give the time between two (--time-step)")
+        if own and step is not None:
+            self.notes = (f"{file}: holds times of its own, so --time-step is not used",)
+        self.time = np.array(own or [k * (step or 0.0) for k in range(count)], np.float64)
+        self._take_in_others()
         self._mesh = self._reader.mesh_grid
+        self.files = (file, *sorted(self._data_files()))
+
+    def _take_in_others(self) -> None:
+        """Arrays of the other time series of the file: some programs write one for every function."""
+        mine = self._reader.collection
+        for series in self._reader.domain:
+            if series.get("CollectionType") != "Temporal" or len(series) != len(mine) or list(series) == list(mine):
+                continue
+            times = [t.attrib.get("Value") for grid in series if (t := grid.find("Time")) is not None]
+            if [float(t or "nan") for t in times] != self.time.tolist():
+                continue
+            for grid, other in zip(mine, series, strict=True):
+                known = {a.get("Name") for a in grid.findall("Attribute")}
+                grid.extend(a for a in other.findall("Attribute") if a.get("Name") not in known)
+
+    def _data_files(self) -> set[Path]:
+        """The HDF5 files with the values, which have to be there whole."""
+        import h5py
+
+        out: set[Path] = set()
         items = self._reader.domain.iter("DataItem")
-        named = {i.text.split(":")[0].strip() for i in items if i.get("Format") == "HDF" and i.text}
-        self.files = (file, *sorted(file.parent / name for name in named if (file.parent / name).is_file()))
+        named = {i.text.strip() for i in items if i.get("Format") == "HDF" and i.text}
+        for name in sorted({text.split(":")[0].strip() for text in named}):
+            path = self.file.parent / name
+            if not path.is_file():
+                raise ReadError(f"{self.file}: its values are in {name}, which is not there; copy it beside")
+            out.add(path)
+            with reading(path), h5py.File(path, "r") as opened:
+                for inside in (text.split(":", 1)[1] for text in named if text.split(":")[0].strip() == name):
+                    found = opened.get(inside)
+                    if isinstance(found, h5py.Dataset):
+                        out |= files_behind(found, path)
+        return out
 
     def place(self, state: int) -> str:
         return f"{self.file}, state {state}"
@@ -199,6 +237,15 @@ class _Files(WholeStates):
         except (Exception, SystemExit) as error:  # meshio leaves the program over a format it does not know
             raise ReadError(f"{file}: not readable with meshio ({_text(error)})") from error
         return _grid(file, mesh.points, mesh.cells, mesh.point_data, mesh.cell_data)
+
+
+def _refuse_checkpoint(file: Path, domain: Any) -> None:
+    """Checkpoints of FEniCS keep a function by its degrees of freedom, not by nodes."""
+    if any(a.get("ItemType") == "FiniteElementFunction" for a in domain.iter("Attribute")):
+        raise ReadError(
+            f"{file}: is a checkpoint of FEniCS (FiniteElementFunction), which keeps no values at nodes; write the "
+            "displacement, interpolated to degree 1, with XDMFFile.write or write_function"
+        )
 
 
 def _text(error: BaseException) -> str:

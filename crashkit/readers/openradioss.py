@@ -27,7 +27,7 @@ from crashkit.readers import _radioss_deck as deck
 from crashkit.readers import register
 from crashkit.readers._cells import LINE, VERTEX, shell_faces, solid_cells, stack_cells
 from crashkit.readers._checks import require_finite, require_indices, require_options, time_problems
-from crashkit.readers._folders import runs_in
+from crashkit.readers._folders import Collected, files_in, named, recognises, runs_in
 from crashkit.readers._names import DISPLACEMENT_NAMES, WALL_NAME, field_name, quantity
 from crashkit.readers._radioss_file import Array, Content, beginning, read_layout, starts_well
 from crashkit.readers._radioss_history import read_history
@@ -46,43 +46,51 @@ class OpenRadioss:
     description = "OpenRadioss animation files (NAMEA001, NAMEA002, ...), plain or gzip"
 
     def sniff(self, path: Path) -> bool:
-        try:
-            return bool(_families(path))
-        except OSError:
-            return False
+        return recognises(_families, path)
 
     def runs(self, path: Path, **options: object) -> Runs:
         require_options(self.name, options)
-        families = _families(path)
-        if not families:
+        found = _families(path)
+        if not found:
             raise ReadError(f"{path}: no OpenRadioss animation files (NAMEA001, NAMEA002, ...) here")
-        return Runs({name: partial(_RadiossRun, name, files) for name, files in families.items()})
+        return Runs({name: partial(_RadiossRun, name, files) for name, files in found.runs.items()}, found.aside)
 
 
-def _families(path: Path) -> dict[str, dict[int, Path]]:
+def _families(path: Path) -> Collected[dict[int, Path]]:
     """Run name -> {number: file} for all runs at `path`."""
     if path.is_file():
         match = _FILE.fullmatch(path.name)
         if match is None or not starts_well(path):
-            return {}
-        found = _families_in(path.parent)
+            return Collected()
+        found = _families_in(path.parent).runs
         root = match["root"]
-        return {root if len(found) > 1 else path.resolve().parent.name: found[root]}
+        return Collected({root if len(found) > 1 else path.resolve().parent.name: found[root]})
     if not path.is_dir():
-        return {}
+        return Collected()
     return runs_in(path, _families_in)
 
 
-def _families_in(folder: Path) -> dict[str, dict[int, Path]]:
+def _families_in(folder: Path) -> Collected[dict[int, Path]]:
     families: dict[str, dict[int, Path]] = {}
-    for file in sorted(folder.iterdir()):
+    for file in files_in(folder):
         match = _FILE.fullmatch(file.name)
-        if match and file.is_file():  # the plain file comes first and wins over its gzip copy
-            families.setdefault(match["root"], {}).setdefault(int(match["number"]), file)
+        if not match:
+            continue
+        states, number = families.setdefault(match["root"], {}), int(match["number"])
+        there = states.setdefault(number, file)  # the plain file comes first and wins over its gzip copy
+        if there.name.removesuffix(".gz") != file.name.removesuffix(".gz"):
+            raise ReadError(
+                f"{folder}: {there.name} and {file.name} have the same number; expected one file a state, so rename or "
+                "remove one of them"
+            )
     # One good file is enough: the damaged ones of its family are to be named, not overlooked.
-    return {
-        root: dict(sorted(files.items())) for root, files in families.items() if any(map(starts_well, files.values()))
-    }
+    return Collected(
+        named(
+            (root, root, dict(sorted(files.items())))
+            for root, files in families.items()
+            if any(map(starts_well, files.values()))
+        )
+    )
 
 
 class _RadiossRun(Run):

@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crashkit.errors import CrashkitError, ReadError
+from crashkit.errors import ReadError
 from crashkit.readers import register
-from crashkit.readers._checks import holds_positions, reading, require_options
-from crashkit.readers._folders import runs_in
+from crashkit.readers._checks import holds_positions, reading, require_options, time_step_option
+from crashkit.readers._folders import Collected, one_file_each, recognises
 from crashkit.readers._grid import Grid, GridSource, Place
 from crashkit.readers._grid_run import GridRun
 from crashkit.readers._vtk_process import point_array_names, read_xml
@@ -49,37 +49,24 @@ class PhysicsNemo:
     description = "PhysicsNeMo Curator's crash data: a VTP file with displacement_t... arrays, or a Zarr store, a run"
 
     def sniff(self, path: Path) -> bool:
-        try:
-            return bool(_found(path))
-        except OSError:
-            return False
+        return recognises(_found, path)
 
     def runs(self, path: Path, **options: object) -> Runs:
         require_options(self.name, options, ("mesh", "time_step"))
-        mesh, step = options.get("mesh"), options.get("time_step")
-        try:
-            step = None if step is None else float(str(step))
-        except ValueError:
-            raise CrashkitError(f"--time-step is {step!r}; expected the time between two states") from None
+        mesh, step = options.get("mesh"), time_step_option(options)
         found = _found(path)
         if not found:
             raise ReadError(
                 f"{path}: no VTP file with arrays displacement_t... and no Zarr store with {_POSITION} here"
             )
         mesh_file = None if mesh is None else Path(str(mesh))
-        return Runs({name: partial(_open, name, file, mesh_file, step) for name, file in found.items()})
+        return Runs(
+            {name: partial(_open, name, file, mesh_file, step) for name, file in found.runs.items()}, found.aside
+        )
 
 
-def _found(path: Path) -> dict[str, Path]:
-    if _is_vtp(path) or _is_zarr(path):
-        return {path.stem: path}
-    if not path.is_dir():
-        return {}
-    return _found_in(path) or runs_in(path, _found_in)
-
-
-def _found_in(folder: Path) -> dict[str, Path]:
-    return {p.stem: p for p in sorted(folder.iterdir()) if _is_vtp(p) or _is_zarr(p)}
+def _found(path: Path) -> Collected[Path]:
+    return one_file_each(path, lambda entry: _is_vtp(entry) or _is_zarr(entry))
 
 
 def _is_vtp(path: Path) -> bool:

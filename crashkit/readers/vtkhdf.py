@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from crashkit.errors import ReadError
 from crashkit.readers import register
 from crashkit.readers._checks import LIBRARY_ERRORS, reading, require_options
-from crashkit.readers._folders import runs_in
+from crashkit.readers._folders import Collected, one_file_each, recognises
 from crashkit.readers._grid import Grid, GridSource, Place
 from crashkit.readers._grid_run import GridRun
+from crashkit.readers._hdf5_data import files_behind
 from crashkit.readers.base import Run, Runs
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -39,34 +40,25 @@ class VtkHdf:
     description = "VTKHDF with time (UnstructuredGrid, PolyData, or a collection of them)"
 
     def sniff(self, path: Path) -> bool:
-        try:
-            return bool(_files(path))
-        except OSError:
-            return False
+        return recognises(_found, path)
 
     def runs(self, path: Path, **options: object) -> Runs:
         require_options(self.name, options)
-        files = _files(path) or ({path.stem: path} if path.is_file() else {})
-        if not files:
+        found = _found(path) or Collected({path.stem: path} if path.is_file() else {})
+        if not found:
             raise ReadError(f"{path}: no VTKHDF file here")
-        return Runs({name: partial(_open, name, file) for name, file in files.items()})
+        return Runs({name: partial(_open, name, file) for name, file in found.runs.items()}, found.aside)
 
 
-def _files(path: Path) -> dict[str, Path]:
-    if path.is_file():
-        return {path.stem: path} if _is_vtkhdf(path) else {}
-    if not path.is_dir():
-        return {}
-    return _files_in(path) or runs_in(path, _files_in)
-
-
-def _files_in(folder: Path) -> dict[str, Path]:
-    return {p.stem: p for p in sorted(folder.iterdir()) if p.is_file() and _is_vtkhdf(p)}
+def _found(path: Path) -> Collected[Path]:
+    return one_file_each(path, _is_vtkhdf)
 
 
 def _is_vtkhdf(file: Path) -> bool:
     import h5py
 
+    if not file.is_file():
+        return False
     with file.open("rb") as stream:
         if stream.read(8) != _MAGIC:
             return False
@@ -95,6 +87,7 @@ class _Part:
 
     def __init__(self, file: Path, group: Any) -> None:
         self.file, self._group = file, group
+        self._behind: dict[str, set[Path]] = {}
         self.name = group.name.rsplit("/", 1)[-1]
         if "Steps" not in group:
             raise ReadError(f"{file}: {group.name} has one state without time; expected a group Steps")
@@ -117,6 +110,8 @@ class _Part:
             raise ReadError(
                 f"{self.file}: no dataset {self._group.name}/{name}; it is damaged or no VTKHDF of version 2"
             )
+        if name not in self._behind:
+            self._behind[name] = files_behind(found, self.file)
         return found
 
     def _all(self, name: str) -> NDArray[Any]:
@@ -200,6 +195,16 @@ class _Part:
         first = self._offset("PointOffsets", state)
         return self._slice("Points", first, first + nodes)
 
+    def require_present(self) -> None:
+        """Values that are absent are to be found now, not while the run is read."""
+        for name in ("Points", *(f"{g}/{n}" for g in ("PointData", "CellData") for n in self._group.get(g, {}))):
+            self._dataset(name)
+
+    @property
+    def files(self) -> set[Path]:
+        """Files that hold values beside the one that was opened."""
+        return set().union(*self._behind.values())
+
     def arrays(self, kind: Place) -> dict[str, str]:
         """Name -> unit of its point or cell arrays."""
         group = self._group.get("PointData" if kind == "point" else "CellData", {})
@@ -238,6 +243,10 @@ class _Steps(GridSource):
         for part in self._parts:
             if not np.array_equal(part.time, self.time):
                 raise ReadError(f"{file}: part {part.name} has other times than part {self._parts[0].name}")
+
+        for part in self._parts:
+            part.require_present()
+        self.files = (file, *sorted(set().union(*(part.files for part in self._parts))))
 
     def place(self, state: int) -> str:
         return f"{self.file}, state {state}"
