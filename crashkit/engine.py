@@ -29,7 +29,7 @@ from crashkit.ingestion.survey import reader_options, wanted_field
 from crashkit.readers import reader_for
 from crashkit.readers.base import Run, Runs
 from crashkit.version import __version__
-from data_schema import CONVENTIONS, to_si, unit_system
+from data_schema import CONVENTIONS, UnknownUnits, to_si, unit_system
 
 
 class CrashBackend(BackendEntrypoint):
@@ -147,7 +147,10 @@ def dataset_of(
         values = lazy(partial(view.field, wanted), np.float32, *shape)
         ds[key] = (("sim", "time", where, *behind), values, {"role": "field", **measured(wanted.unit)})
     for key, parameter in run.parameters.items():
-        factor, unit = to_si(parameter.unit)
+        try:
+            factor, unit = to_si(parameter.unit)
+        except UnknownUnits as error:
+            raise DataError(f"run {run.name}, parameter {key}: {error}") from error
         ds[key] = ("sim", np.array([parameter.value * factor]), {"units": unit, "role": "parameter"})
     files = [{"run": run.name, "file": f.name, "bytes": f.stat().st_size, "sha256": None} for f in run.files]
     ds.attrs = {

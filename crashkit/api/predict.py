@@ -112,7 +112,7 @@ def _value(name: str, given: float | str, unit: str) -> float:
     import math
 
     from crashkit.errors import DataError
-    from data_schema import to_si
+    from data_schema import UnknownUnits, to_si
 
     if not isinstance(given, str):
         value = float(given)
@@ -122,7 +122,10 @@ def _value(name: str, given: float | str, unit: str) -> float:
             raise DataError(f"{name}={given}: expected a number, with a unit if you like, such as {name}=1{unit}")
         value = float(found[1])
         if found[2]:
-            factor, si = to_si(found[2])
+            try:
+                factor, si = to_si(found[2])
+            except UnknownUnits as error:
+                raise DataError(f"{name}={given}: {error}") from error
             if si != to_si(unit)[1]:
                 raise DataError(
                     f"{name}={given}: the unit {found[2]!r} is not one of {name}, which is in {unit or 'no unit'}"

@@ -1,25 +1,44 @@
 """Design parameters from a table beside the runs: CSV, JSON or XLSX, one row a run.
 
 The column `run` names the run as the dataset does; every other column is a parameter, with its unit in brackets
-behind the name (`impact_speed [m/s]`) or in a YAML file of the same name beside the table (`impact_speed: m/s`).
-JSON is a list of such rows, or an object of them by run name.
+behind the name (`impact_speed [m/s]`), in a row of units below the header, or in a YAML file of the same name beside
+the table (`impact_speed: m/s`). JSON is a list of such rows, or an object of them by run name.
+
+Tables come out of many spreadsheets. What they leave in a file is read where it has one meaning: commas, semicolons
+or tabs between cells, a line `sep=;`, UTF-8, UTF-16 or the Windows code page, titles and comments above the header, an
+empty column at the end, a comma as decimal mark or between thousands. Where it has two, the table is refused.
 """
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import re
-from collections.abc import Mapping
+import zipfile
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from crashkit.errors import DataError, ReadError
 from crashkit.extras import need
+from crashkit.readers._parameters import parameter_columns, parameter_name
+from data_schema.units import is_unit
 
-_HEADER = re.compile(r"\s*(?P<name>[^\[(]+?)\s*(?:[\[(](?P<unit>[^\])]*)[\])])?\s*")
+# The column with the names of the runs, the first that is there; the others are names for people.
 _KEYS = ("run", "sim", "name")
 SUFFIXES = (".csv", ".json", ".xlsx")
+# The header stands in one of the first rows: above it are titles.
+_TITLE_ROWS = 20
+_UNIT_ROWS = ("", "unit", "units", "einheit", "einheiten", "-", "[-]")
+# A table of parameters is small; a workbook is packed and could be made to fill the memory.
+_MOST_BYTES = 64 << 20
+_PLAIN = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+_DECIMAL_COMMA = re.compile(r"[-+]?(?:\d{1,3}(?:\.\d{3})+|\d*),\d+(?:[eE][-+]?\d+)?")
+_THOUSANDS = re.compile(r"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d*)?")
+_SPACES = re.compile(r"(?<=\d)[\u00a0\u202f' ](?=\d{3}(?:\D|$))")
 
 
 @dataclass(frozen=True)
@@ -29,19 +48,30 @@ class ParameterTable:
     path: Path
     rows: Mapping[str, Mapping[str, tuple[float, str]]]
 
-    def row(self, run: str) -> Mapping[str, tuple[float, str]]:
-        """The parameters of `run`.
+    def key(self, run: str) -> str:
+        """The name of the row of `run`: its own, or the same number written otherwise where only one row is that.
 
-        Raises
-        ------
-        DataError
-            If it has no row.
+        Run 001 and run_001 have row 1 where the table knows its runs by their numbers alone. Raises DataError if there
+        is no such row, or if there are several.
         """
-        if run not in self.rows:
-            names = list(self.rows)
-            known = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
-            raise DataError(f"{self.path}: has no row for run {run}; its rows are for {known}")
-        return self.rows[run]
+        if run in self.rows:
+            return run
+        number = re.search(r"\d+$", run)
+        if number is not None and all(key.isdigit() for key in self.rows):
+            alike = [key for key in self.rows if int(key) == int(number[0])]
+            if len(alike) == 1:
+                return alike[0]
+            if alike:
+                raise DataError(
+                    f"{self.path}: rows {' and '.join(alike)} could both be that of run {run}; name it as {run}"
+                )
+        names = list(self.rows)
+        known = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+        raise DataError(f"{self.path}: has no row for run {run}; its rows are for {known}")
+
+    def row(self, run: str) -> Mapping[str, tuple[float, str]]:
+        """The parameters of `run`. Raises DataError if it has no row."""
+        return self.rows[self.key(run)]
 
 
 def read_parameter_table(path: Path) -> ParameterTable:
@@ -54,30 +84,30 @@ def read_parameter_table(path: Path) -> ParameterTable:
     DataError
         Naming a run with two rows.
     """
-    header, lines = _load(path)
-    columns: dict[str, tuple[str, str]] = {}
-    for column in header:
-        match = _HEADER.fullmatch(column)
-        if match is None:
-            raise ReadError(f"{path}: column {column!r} is no parameter name; expected name or name [unit]")
-        columns[column] = (re.sub(r"\W+", "_", match["name"]), (match["unit"] or "").strip())
-    key = next((c for c, (name, _) in columns.items() if name.lower() in _KEYS), None)
+    table = _load(path)
+    key = next((k for name in _KEYS for k, c in enumerate(table.header) if _plain(c) == name), None)
     if key is None:
-        raise ReadError(f"{path}: no column called run; its columns are {', '.join(header) or 'none'}")
-    units = _units_beside(path)
+        raise ReadError(
+            f"{path}: no column called run; its columns are {', '.join(filter(None, table.header)) or 'none'}"
+        )
+    chosen = [k for k, c in enumerate(table.header) if k != key and _plain(c) not in _KEYS]
+    columns = parameter_columns([table.header[k] for k in chosen], [""] * len(chosen), str(path))
+    body, below = _without_units_row(table, key, chosen)
+    beside = _units_beside(path)
+    mark = _decimal_mark(body, chosen, path)
     rows: dict[str, dict[str, tuple[float, str]]] = {}
     twice: list[str] = []
-    for number, line in enumerate(lines, 2):
-        run = _text(line.get(key))
+    for number, line in body:
+        run = _text(line[key])
         if not run:
-            raise ReadError(f"{path}: row {number} names no run in column {key!r}")
+            raise ReadError(f"{path}: row {number} names no run in column {table.header[key]!r}")
         if run in rows:
             twice.append(run)
-        rows[run] = {
-            name: (_number(line.get(column), f"{path}: row {number} (run {run}), column {column!r}"), unit or units.get(name, ""))
-            for column, (name, unit) in columns.items()
-            if column != key
-        }  # fmt: skip
+        values = {}
+        for k, (name, unit) in zip(chosen, columns, strict=True):
+            place = f"{path}: row {number} (run {run}), column {table.header[k]!r}"
+            values[name] = (_number(line[k], mark, place), unit or below.get(k, "") or beside.get(name, ""))
+        rows[run] = values
     if twice:
         raise DataError(f"{path}: more than one row for run {', '.join(dict.fromkeys(twice))}; keep one each")
     if not rows:
@@ -85,52 +115,152 @@ def read_parameter_table(path: Path) -> ParameterTable:
     return ParameterTable(path, rows)
 
 
-def _load(path: Path) -> tuple[list[str], list[dict[str, Any]]]:
-    """Column names, and one dictionary a row."""
+@dataclass(frozen=True)
+class _Table:
+    """Titles of the columns, and (row in the file, cells) of what stands below; as many cells as columns."""
+
+    header: list[str]
+    lines: list[tuple[int, list[Any]]]
+
+
+def _load(path: Path) -> _Table:
     if not path.is_file():
         raise ReadError(f"{path}: no such parameter table")
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise ReadError(f"{path}: a parameter table is {', '.join(SUFFIXES)}, not {suffix or 'without suffix'}")
+    if path.stat().st_size > _MOST_BYTES:
+        raise ReadError(f"{path}: has {path.stat().st_size >> 20} MB; expected a table with a row a run, below 64 MB")
+    read = {".json": _json_rows, ".xlsx": _workbook_rows, ".csv": _text_rows}[suffix]
     try:
-        lines = _json_rows(path) if suffix == ".json" else _sheet_rows(path)
+        lines = read(path)
     except ReadError:
         raise
     except Exception as error:  # each library below has errors of its own
         text = " ".join(str(error).split()) or type(error).__name__
         raise ReadError(f"{path}: cannot be read as a table ({text[:160]})") from error
-    header = [_text(cell) for cell in lines[0]] if lines else []
-    doubled = next((c for c in header if header.count(c) > 1), None)
+    lines = [(number, line) for number, line in lines if any(_text(cell) for cell in line)]
+    if not lines:
+        raise ReadError(f"{path}: cannot be read as a table (it is empty)")
+    above = next(
+        (k for k, (_, line) in enumerate(lines[:_TITLE_ROWS]) if any(_plain(_text(c)) in _KEYS for c in line)), 0
+    )
+    header = [_text(cell) for cell in lines[above][1]]
+    width = max(len(line) for _, line in lines[above:])
+    header += [""] * (width - len(header))
+    body = [(number, [*line, *[None] * (width - len(line))]) for number, line in lines[above + 1 :]]
+    # A column without a title and without values is what a separator at the end of each line leaves.
+    kept = [k for k in range(width) if header[k] or any(_text(line[k]) for _, line in body)]
+    doubled = next((c for c, times in Counter(header[k] for k in kept).items() if c and times > 1), None)
     if doubled is not None:
         raise ReadError(f"{path}: column {doubled!r} stands there twice")
-    if "" in header:
-        raise ReadError(f"{path}: column {header.index('') + 1} has no name")
-    return header, [dict(zip(header, line)) for line in lines[1:] if any(_text(cell) for cell in line)]
+    nameless = next((k for k in kept if not header[k]), None)
+    if nameless is not None:
+        raise ReadError(f"{path}: column {nameless + 1} has values and no name; name it in the header, or empty it")
+    return _Table([header[k] for k in kept], [(number, [line[k] for k in kept]) for number, line in body])
 
 
-def _sheet_rows(path: Path) -> list[list[Any]]:
+def _plain(title: str) -> str:
+    """A column's title as it is compared with `_KEYS`."""
+    return re.sub(r"\W+", "", title).lower()
+
+
+def _text_rows(path: Path) -> list[tuple[int, list[Any]]]:
+    text = _decoded(path.read_bytes(), path)
+    lines = text.splitlines()
+    separator = ""
+    if lines and (stated := re.fullmatch(r"\s*\"?sep=(.)\"?\s*", lines[0], re.IGNORECASE)):
+        separator = stated[1]
+        lines[0] = ""
+    lines = ["" if line.lstrip().startswith("#") else line for line in lines]
+    if not separator:
+        # That of the header, which is the first line that names the column of the runs.
+        pattern = re.compile(rf'(?:^|[,;\t|])\s*"?(?:{"|".join(_KEYS)})"?\s*(?:[,;\t|]|$)', re.IGNORECASE)
+        header = next((line for line in lines[:_TITLE_ROWS] if pattern.search(line)), next(filter(None, lines), ""))
+        separator = max(";\t|,", key=header.count)
+    reader = csv.reader(io.StringIO("\n".join(lines)), delimiter=separator, skipinitialspace=True, strict=True)
+    return [(reader.line_num, list(row)) for row in reader]
+
+
+def _decoded(content: bytes, path: Path) -> str:
+    """Text in UTF-8 or UTF-16, which say so themselves or are valid, else in the code page of Windows."""
+    if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        text = content.decode("utf-16")
+    else:
+        try:
+            text = content.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            text = content.decode("cp1252", errors="replace")
+    if "\0" in text:
+        raise ReadError(f"{path}: holds bytes that are no text; save the table as CSV in UTF-8, or as XLSX")
+    return text
+
+
+def _workbook_rows(path: Path) -> list[tuple[int, list[Any]]]:
     import pandas as pd
 
-    if path.suffix.lower() == ".xlsx":
-        need(f"reading {path}", "formats")
-        frame = pd.read_excel(path, header=None, dtype=object)
-    else:
-        options: dict[str, Any] = {"header": None, "dtype": str, "skipinitialspace": True, "encoding": "utf-8-sig"}
-        with path.open(encoding="utf-8-sig") as stream:
-            first = stream.readline()
-        separator = max(",;\t", key=first.count)  # what the header uses; a single column has none
-        frame = pd.read_csv(path, sep=separator, **options)
-    return [list(row) for row in frame.itertuples(index=False)]
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as packed:
+            size = sum(entry.file_size for entry in packed.infolist())
+        if size > 4 * _MOST_BYTES:
+            raise ReadError(f"{path}: unpacks to {size >> 20} MB; expected a table with a row a run")
+    need(f"reading {path}", "formats")
+    frame = pd.read_excel(path, header=None, dtype=object)
+    return [(number, list(row)) for number, row in enumerate(frame.itertuples(index=False), 1)]
 
 
-def _json_rows(path: Path) -> list[list[Any]]:
-    data = json.loads(path.read_text(encoding="utf-8"))
+def _json_rows(path: Path) -> list[tuple[int, list[Any]]]:
+    def distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        twice = next((name for name, times in Counter(name for name, _ in pairs).items() if times > 1), None)
+        if twice is not None:
+            raise ReadError(f"{path}: {twice!r} stands there twice in one object; keep one each")
+        return dict(pairs)
+
+    data = json.loads(_decoded(path.read_bytes(), path), object_pairs_hook=distinct)
     if isinstance(data, dict) and all(isinstance(row, dict) for row in data.values()):
         data = [{"run": run, **row} for run, row in data.items()]
     if not isinstance(data, list) or not data or not all(isinstance(row, dict) for row in data):
         raise ReadError(f"{path}: expected a list of rows, or an object of rows by run name")
     header = list(dict.fromkeys(column for row in data for column in row))
-    return [header, *([row.get(column) for column in header] for row in data)]
+    return [(1, header), *((k, [row.get(column) for column in header]) for k, row in enumerate(data, 2))]
+
+
+def _without_units_row(
+    table: _Table, key: int, chosen: Sequence[int]
+) -> tuple[list[tuple[int, list[Any]]], dict[int, str]]:
+    """The rows of runs, and the units of columns where the first row below the header holds them."""
+    if not table.lines:
+        return table.lines, {}
+    first = table.lines[0][1]
+    cells = {k: _text(first[k]).strip("[]() ") for k in chosen}
+    told = {k: text for k, text in cells.items() if text}
+    if _text(first[key]).lower() not in _UNIT_ROWS or not told or not all(is_unit(text) for text in told.values()):
+        return table.lines, {}
+    return table.lines[1:], {k: "" if text == "-" else text for k, text in told.items()}
+
+
+def _decimal_mark(body: Sequence[tuple[int, list[Any]]], chosen: Sequence[int], path: Path) -> str:
+    """What a comma in the numbers of the table is: "decimal", "thousands", or "" where there is none.
+
+    Raises ReadError where both would do ("350,000"), or cells contradict each other.
+    """
+    cells = [(number, _SPACES.sub("", _text(line[k]))) for number, line in body for k in chosen]
+    with_comma = [(number, text) for number, text in cells if "," in text]
+    decimal = [(n, t) for n, t in with_comma if _DECIMAL_COMMA.fullmatch(t) and not _THOUSANDS.fullmatch(t)]
+    thousands = [(n, t) for n, t in with_comma if _THOUSANDS.fullmatch(t) and not _DECIMAL_COMMA.fullmatch(t)]
+    either = [(n, t) for n, t in with_comma if _THOUSANDS.fullmatch(t) and _DECIMAL_COMMA.fullmatch(t)]
+    if decimal and thousands:
+        raise ReadError(
+            f"{path}: the comma is a decimal mark in row {decimal[0][0]} ({decimal[0][1]}) and stands between thousands in "
+            f"row {thousands[0][0]} ({thousands[0][1]}); write all numbers with a decimal point"
+        )
+    if either and not decimal and not thousands:
+        number, text = either[0]
+        raise ReadError(
+            f"{path}: row {number}: {text!r} may be {text.replace(',', '')} or {text.replace(',', '.')}; write it without "
+            "the comma, or with a decimal point"
+        )
+    return "decimal" if decimal else "thousands" if thousands else ""
 
 
 def _text(cell: Any) -> str:
@@ -140,11 +270,16 @@ def _text(cell: Any) -> str:
     return str(int(cell)) if isinstance(cell, float) and cell.is_integer() else str(cell).strip()
 
 
-def _number(cell: Any, place: str) -> float:
-    try:
+def _number(cell: Any, mark: str, place: str) -> float:
+    if isinstance(cell, (int, float)) and not isinstance(cell, bool):
         value = float(cell)
-    except (TypeError, ValueError):
-        value = float("nan")
+    else:
+        text = _SPACES.sub("", _text(cell))
+        if mark == "decimal" and _DECIMAL_COMMA.fullmatch(text):
+            text = text.replace(".", "").replace(",", ".")
+        elif mark == "thousands" and _THOUSANDS.fullmatch(text):
+            text = text.replace(",", "")
+        value = float(text) if _PLAIN.fullmatch(text) else float("nan")
     if value != value or abs(value) == float("inf"):
         raise ReadError(f"{place}: found {_text(cell) or 'nothing'!r}, expected a number")
     return value
@@ -155,7 +290,7 @@ def _units_beside(path: Path) -> Mapping[str, str]:
 
     for suffix in (".yaml", ".yml"):
         beside = path.with_suffix(suffix)
-        if not beside.exists():
+        if not beside.is_file():
             continue
         try:
             units = yaml.safe_load(beside.read_text(encoding="utf-8"))
@@ -163,5 +298,5 @@ def _units_beside(path: Path) -> Mapping[str, str]:
             raise ReadError(f"{beside}: not readable as YAML ({' '.join(str(error).split())[:160]})") from error
         if not isinstance(units, dict):
             raise ReadError(f"{beside}: expected lines such as impact_speed: m/s")
-        return {str(name): str(unit) for name, unit in units.items()}
+        return {parameter_name(str(name), str(beside)): str(unit) for name, unit in units.items()}
     return {}

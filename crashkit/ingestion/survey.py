@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.errors import CrashkitError, DataError, ReadError
-from crashkit.ingestion.parameter_table import read_parameter_table
+from crashkit.ingestion.parameter_table import ParameterTable, read_parameter_table
 from crashkit.ingestion.structure import Structure, matched, structure_of
-from crashkit.readers import reader_for
+from crashkit.readers import passed_over, reader_for
 from crashkit.readers._checks import reading
+from crashkit.readers._parameters import parameter_columns
 from crashkit.readers.base import FieldInfo, Run, Runs
 from data_schema import DIMENSIONS, VARIABLES, to_si, unit_system
 from data_schema.units import UnknownUnits, si_unit
@@ -158,6 +159,7 @@ def survey(
     """
     table = read_parameter_table(params) if params is not None else None
     out = Survey(structure=structure)
+    used: dict[str, str] = {}
     for source in sources:
         for index, name, run in each_run(source, choice, out, stop):
             tell(name)
@@ -165,7 +167,7 @@ def survey(
                 with reading(source):
                     found = _look(run, name, source, index, choice, out)
                 if table is not None:
-                    row = table.row(name)
+                    row = table.rows[_row_of(table, name, used, out)]
                     written = {**found.as_written, **{n: unit for n, (_, unit) in row.items()}}
                     found = replace(found, parameters=_from_table(found, row, out, table.path), as_written=written)
                 out.found.append(_same_parameters(found, out))
@@ -174,7 +176,7 @@ def survey(
             finally:
                 run.close()
     if table is not None:
-        unused = [r for r in table.rows if r not in {f.name for f in out.found} | set(out.skipped)]
+        unused = [r for r in table.rows if r not in used and r not in out.skipped]
         if unused:
             out.note(f"{table.path}: {_listed(unused)} in the table, but no such run was given")
     _refuse_short(out, choice, time, stop)
@@ -185,10 +187,25 @@ def survey(
     return out
 
 
+def _row_of(table: ParameterTable, run: str, used: dict[str, str], out: Survey) -> str:
+    """The row of `run`; one that another run has taken by its number belongs to neither."""
+    key = table.key(run)
+    if used.setdefault(key, run) != run:
+        raise DataError(
+            f"{table.path}: row {key} could be that of run {used[key]} and of run {run}; name the rows as the runs"
+        )
+    if key != run:
+        out.note(f"{table.path}: knows runs by their numbers, so run {run} has row {key}")
+    return key
+
+
 def each_run(source: Path, choice: Choice, out: Survey, stop: bool) -> Iterator[tuple[int, str, Run]]:
     """(place in the source, name in the dataset, run); runs that cannot be opened are refused."""
     with reading(source):
-        runs = reader_for(source, choice.reader).runs(source, **dict(choice.reader_options))
+        reader = reader_for(source, choice.reader)
+        runs = reader.runs(source, **dict(choice.reader_options))
+    for text in (*getattr(runs, "passed_over", ()), *(passed_over(source, reader) if choice.reader is None else ())):
+        out.note(text)
     index = -1
     while True:
         index += 1
@@ -265,7 +282,8 @@ def cell_fields(run: Run, name: str) -> list[str]:
 
 def _named(run: str, source: Path, pattern: str) -> str:
     try:
-        return pattern.format(run=run, source=source.resolve().name.split(".")[0])
+        whole = source.resolve()
+        return pattern.format(run=run, source=whole.name if whole.is_dir() else whole.stem)
     except (KeyError, IndexError, ValueError) as error:
         raise DataError(
             f"names {pattern!r} not understood ({error}); expected text with {{run}} and {{source}}"
@@ -293,7 +311,7 @@ def _look(run: Run, name: str, source: Path, index: int, choice: Choice, out: Su
     if not np.isfinite(structure.position).all():
         node = int(np.argmin(np.isfinite(structure.position).all(axis=1)))
         raise DataError(f"{source}: node {structure.node_id[node]} has an undeformed position that is no number")
-    for text in structure.notes:
+    for text in (*structure.notes, *run.notes):
         out.note(text)
     if out.structure is None:
         out.structure = structure
@@ -309,7 +327,9 @@ def _look(run: Run, name: str, source: Path, index: int, choice: Choice, out: Su
         out.note(f"left out of {source.name}: {', '.join(run.left_out)}")
     missing = [n for n in choice.fields if n not in fields]
     if missing:
-        out.note(f"run {name} has no {', '.join(missing)}; it has {', '.join(run.fields) or 'no further field'}")
+        reasons = [f"{n}: {run.withheld[n]}" for n in missing if n in run.withheld]
+        told = "; ".join(reasons) or f"it has {', '.join(run.fields) or 'no further field'}"
+        out.note(f"run {name} has no {', '.join(missing)}; {told}")
     return Found(
         source=source,
         run=run.name,
@@ -385,10 +405,14 @@ def _refuse_short(out: Survey, choice: Choice, time: NDArray[np.float64] | None,
 
 def _in_dataset_units(values: Mapping[str, tuple[float, str]], place: Any) -> dict[str, tuple[float, str]]:
     out = {}
-    for name, (value, unit) in values.items():
+    columns = parameter_columns(list(values), [unit for _, unit in values.values()], str(place))
+    for (name, unit), (value, _) in zip(columns, values.values(), strict=True):
         if name in VARIABLES or name in DIMENSIONS:
             raise DataError(f"{place}: a parameter cannot be called {name!r}, which means something else; rename it")
-        factor, si = to_si(unit)
+        try:
+            factor, si = to_si(unit)
+        except UnknownUnits as error:
+            raise DataError(f"{place}: parameter {name}: {error}") from error
         if not np.isfinite(value):
             raise DataError(f"{place}: parameter {name} is {value}; expected a number")
         out[name] = (value * factor, si)
@@ -403,9 +427,11 @@ def _from_table(
     both = [n for n in values if n in found.parameters and found.parameters[n] != values[n]]
     if both:
         out.note(f"{path}: {', '.join(both)} of the table taken instead of the source's own")
-    for name, (_, unit) in row.items():
+    for name, (value, unit) in row.items():
         if not unit:
             out.note(f"{path}: {name} has no unit and is taken for a plain number; name it as {name} [unit]")
+        if value < 0 and "speed" in name.lower():
+            out.note(f"{path}: {name} is negative in the row of run {found.name}; is that meant?")
     return {**found.parameters, **values}
 
 

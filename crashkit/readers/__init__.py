@@ -13,8 +13,9 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from crashkit.errors import CrashkitError, ReadError
-from crashkit.readers._checks import is_damaged_hdf5
-from crashkit.readers.base import Reader
+from crashkit.readers._checks import LIBRARY_ERRORS, is_damaged_hdf5
+from crashkit.readers._foreign import name_of
+from crashkit.readers.base import Reader, Runs
 
 ENTRY_POINT_GROUP = "crashkit.readers"
 _log = logging.getLogger(__name__)
@@ -64,6 +65,28 @@ def reader_for(path: Path, name: str | None = None) -> Reader:
     for reader in known.values():
         if reader.sniff(path):
             return reader
+    what = name_of(path)
+    if what is not None:
+        raise ReadError(f"{path}: {what}")
     damaged = "it begins like an HDF5 file and cannot be opened as one, so it was cut short or damaged: copy it again"
     advice = damaged if is_damaged_hdf5(path) else "check the path, or name the format with --reader"
     raise ReadError(f"{path}: the content is none of the known formats ({', '.join(sorted(known))}); {advice}")
+
+
+def passed_over(path: Path, taken: Reader) -> list[str]:
+    """What the folder `path` holds for other readers than the one `taken`, in words."""
+    out = []
+    for reader in readers().values() if path.is_dir() else ():
+        if reader is taken or not reader.sniff(path):
+            continue
+        try:
+            runs = reader.runs(path)
+            names = runs.names if isinstance(runs, Runs) else ()
+        except (CrashkitError, *LIBRARY_ERRORS):
+            names = ()
+        told = f" ({', '.join(names[:3])}{', ...' if len(names) > 3 else ''})" if names else ""
+        out.append(
+            f"{path}: read as {taken.name}; what it also holds for {reader.name}{told} is passed over: name those files, or "
+            f"say --reader {reader.name}"
+        )
+    return out

@@ -24,6 +24,8 @@ _HEADER_WORDS = 64
 # More than this is read of the first file only where its header asks for it (part titles, rigid bodies).
 _SLACK = 32 << 20
 _D3PLOT, _D3PART = 1, 5
+# The word with the number of parts, and what FEMZIP writes there.
+_NMMAT, _FEMZIP = 51, 76_893_465
 # Words of the header that are counts, by the names of LS-DYNA's database manual.
 _COUNTS = (
     "numnp", "nglbv", "nummat8", "nv3d", "nel2", "nummat2", "nv1d", "nel4", "nummat4", "nv2d", "neiph", "neips",
@@ -51,6 +53,17 @@ def word_size(file: Path) -> int | None:
         if kinds % 1000 in (_D3PLOT, _D3PART) and 2 <= dimensions <= 9 and nodes > 0 and code in (2, 6):
             return size
     return None
+
+
+def is_femzip(file: Path) -> bool:
+    """Whether a file begins like a d3plot that FEMZIP has packed: its number of materials is a mark."""
+    with file.open("rb") as stream:
+        head = stream.read(_HEADER_WORDS * 8)
+    kinds = ((4, "<i4"), (8, "<i8"))
+    return any(
+        len(head) >= _HEADER_WORDS * size and np.frombuffer(head[: _HEADER_WORDS * size], kind)[_NMMAT] == _FEMZIP
+        for size, kind in kinds
+    )
 
 
 class D3plotFile:

@@ -9,17 +9,20 @@ from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 
+from crashkit.readers._folders import files_in
 from data_schema import UnknownUnits, unit_system
 
 _UNIT_NAMES = {"mg": "t", "ton": "t", "mus": "us", "msec": "ms", "sec": "s"}
 # /BEGIN stands at the head of a starter deck, /RUN somewhere in an engine deck, which is short.
 _LINES = 2000
+# A card has 80 columns; a line without an end is no card.
+_LINE_BYTES = 4096
 
 
 def decks(folder: Path, root: str) -> tuple[Path, ...]:
     """The decks of the run `root`: starter (0000) first, then the engine's (0001, ...), plain or gzip."""
     name = re.compile(re.escape(root) + r"_(\d{4})\.rad(?:\.gz)?")
-    found = {m[1]: file for file in sorted(folder.iterdir(), reverse=True) if (m := name.fullmatch(file.name))}
+    found = {m[1]: file for file in reversed(list(files_in(folder))) if (m := name.fullmatch(file.name))}
     return tuple(file for _, file in sorted(found.items()))
 
 
@@ -66,7 +69,7 @@ def _lines(file: Path) -> Iterator[str]:
         with (
             gzip.open(file, "rt", encoding="latin-1") if file.suffix == ".gz" else file.open(encoding="latin-1") as text
         ):
-            for line in islice(text, _LINES):
+            for line in islice(iter(lambda: text.readline(_LINE_BYTES), ""), _LINES):
                 if not line.startswith("#") and line.strip():
                     yield line.strip()
     except (OSError, EOFError, zlib.error):

@@ -24,6 +24,8 @@ from crashkit.errors import ReadError
 MAGIC = b"\x00\x00\x54\x2c"
 _TEXT, _PART_TEXT = 81, 50
 _MASSES, _NUMBERS, _SOLIDS, _LINES, _TREE, _HISTORY, _SPH = 0, 1, 2, 3, 4, 5, 7
+# Packed results grow by a factor of 3 to 20 when unpacked; only what is made to fill the memory grows by more than this.
+_EXPANSION, _UNPACKED_FREELY = 200, 64 << 20
 # Time, texts, flags, counts.
 _FLAGS_AT = 8 + 3 * _TEXT
 _HEADER = _FLAGS_AT + 18 * 4
@@ -78,21 +80,73 @@ def _first_bytes(file: Path, count: int) -> bytes:
 
 
 class Content:
-    """The bytes of one animation file: fetched from the disk piece by piece, or unpacked from gzip."""
+    """The bytes of one animation file: fetched from the disk piece by piece, or unpacked from gzip as far as asked for.
+
+    `size` is that of the whole file; of a gzip file it is what its last four bytes say.
+    """
 
     def __init__(self, file: Path) -> None:
         self.file = file
-        self._unpacked = _unpack(file) if file.suffix == ".gz" else None
-        self.size = file.stat().st_size if self._unpacked is None else len(self._unpacked)
+        self._packed = file.suffix == ".gz"
+        self._unpacked = bytearray()
+        self._stream = gzip.GzipFile(file) if self._packed else None
+        with file.open("rb") as stream:
+            self._on_disk = self.size = stream.seek(0, 2)
+            if self._packed and self.size >= 4:
+                stream.seek(-4, 2)
+                self.size = int.from_bytes(stream.read(4), "little")
 
     @property
     def held(self) -> int:
         """Bytes in memory."""
-        return len(self._unpacked or b"")
+        return len(self._unpacked)
+
+    @property
+    def end(self) -> int:
+        """Where the content ends, as far as it was looked at."""
+        return len(self._unpacked) if self._packed else self.size
+
+    def reaches(self, end: int) -> bool:
+        """Whether the file has at least `end` bytes."""
+        if not self._packed:
+            return end <= self.size
+        if end > max(_UNPACKED_FREELY, _EXPANSION * self._on_disk):
+            raise ReadError(
+                f"{self.file}: {self._on_disk} packed bytes would become {end} or more, which no result does; the file is "
+                "damaged or was made to fill the memory"
+            )
+        self._unpack(end)
+        return end <= len(self._unpacked)
+
+    def finish(self, end: int) -> None:
+        """Look at what stands behind byte `end`, where the content should: only then gzip has checked its sum."""
+        if self._packed:
+            self._unpack(end + 1)
+            self.size = max(self.size, len(self._unpacked))
+            self._close()
+
+    def _unpack(self, end: int) -> None:
+        try:
+            while self._stream is not None and len(self._unpacked) < end:
+                piece = self._stream.read(min(1 << 20, end - len(self._unpacked)))
+                if not piece:
+                    self._close()
+                self._unpacked += piece
+        except (OSError, EOFError, zlib.error) as error:
+            raise ReadError(
+                f"{self.file}: the gzip stream is damaged behind byte {len(self._unpacked)} of its content ({error}); "
+                "the file is cut short or damaged, copy it again"
+            ) from error
+
+    def _close(self) -> None:
+        if self._stream is not None:
+            self._stream.close()
+        self._stream = None
 
     def read(self, offset: int, count: int) -> bytes:
-        if self._unpacked is not None:
-            return self._unpacked[offset : offset + count]
+        if self._packed:
+            self.reaches(offset + count)
+            return bytes(memoryview(self._unpacked)[offset : offset + count])
         with self.file.open("rb") as stream:
             stream.seek(offset)
             return stream.read(count)
@@ -102,20 +156,6 @@ class Content:
         if len(found) != where.bytes:  # the file shrank since it was opened
             raise ReadError(f"{self.file}: ends at byte {where.offset + len(found)}; expected {where.bytes} bytes more")
         return np.frombuffer(found, where.dtype).reshape(where.shape)
-
-
-def _unpack(file: Path) -> bytes:
-    pieces: list[bytes] = []
-    try:
-        with gzip.open(file) as stream:
-            while piece := stream.read(1 << 20):
-                pieces.append(piece)
-    except (OSError, EOFError, zlib.error) as error:
-        raise ReadError(
-            f"{file}: the gzip stream is damaged behind byte {sum(map(len, pieces))} of its content ({error}); "
-            "the file is cut short or damaged, copy it again"
-        ) from error
-    return b"".join(pieces)
 
 
 @dataclass(frozen=True)
@@ -169,10 +209,10 @@ class _Cursor:
 
     def array(self, what: str, dtype: str, *shape: int) -> Array:
         found = Array(self.offset, dtype, shape)
-        if min(shape) < 0 or self.offset + found.bytes > self._content.size:
+        if min(shape) < 0 or not self._content.reaches(self.offset + found.bytes):
             raise ReadError(
                 f"{self._content.file}: {what} at byte {self.offset} should take {found.bytes} bytes, but the file "
-                f"ends at byte {self._content.size}; it is cut short or damaged, copy it again or compute it again"
+                f"ends at byte {self._content.end}; it is cut short or damaged, copy it again or compute it again"
             )
         self.offset += found.bytes
         return found
@@ -240,6 +280,7 @@ def read_layout(content: Content) -> Layout:
             cursor.array("the names of the time history", "u1", listed, _PART_TEXT)
     if flags[_SPH]:
         kinds["sph"] = _read_elements(cursor, flags, "particles", 1, 6)
+    content.finish(cursor.offset)
     for kind, elements in kinds.items():
         _check_parts(content.file, kind, elements)
     return Layout(time, (*flags, *counts), position, node_numbers, node_values, kinds, cursor.offset)

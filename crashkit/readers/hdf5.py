@@ -10,7 +10,7 @@
     history/<curve>               (run, sample), with attribute `units`; history/time (sample,) or (run, sample)
     run                           (run,) the campaign's own numbers, which name the runs
     parameter                     (run, parameter), with attributes `names` and `units`
-    time                          (state,), or (run, state)
+    time                          (state,), or (run, state); where it is missing, the option `time_step` gives it
 
 Any group name will do. Lengths in metre are told by the attribute `units` of the displacements; then the unit
 system is SI, else the user must say.
@@ -38,8 +38,11 @@ from crashkit.readers._checks import (
     require_indices,
     require_options,
     time_problems,
+    time_step_option,
 )
+from crashkit.readers._hdf5_data import files_behind
 from crashkit.readers._names import quantity
+from crashkit.readers._parameters import parameter_columns
 from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh, Runs
 from crashkit.readers.history import Channel, History
 
@@ -79,10 +82,10 @@ class KartHdf5:
             return False
 
     def runs(self, path: Path, **options: object) -> Runs:
-        require_options(self.name, options, ("mesh",))
-        mesh = options.get("mesh")
+        require_options(self.name, options, ("mesh", "time_step"))
+        mesh, step = options.get("mesh"), time_step_option(options)
         with reading(path):
-            campaign = _Campaign(path, None if mesh is None else Path(str(mesh)))
+            campaign = _Campaign(path, None if mesh is None else Path(str(mesh)), step)
         return Runs({campaign.name(k): partial(_KartRun, campaign, k) for k in range(campaign.runs)})
 
 
@@ -111,9 +114,11 @@ def _group(file: h5py.File) -> str | None:
 class _Campaign:
     """The file, opened once for all its runs, with everything they share."""
 
-    def __init__(self, path: Path, mesh: Path | None) -> None:
+    def __init__(self, path: Path, mesh: Path | None, step: float | None) -> None:
         self.path = path
         self.file = _open(path)
+        self._behind: dict[str, set[Path]] = {}
+        self.notes: tuple[str, ...] = ()
         group = _group(self.file)
         if group is None:
             raise ReadError(
@@ -127,9 +132,8 @@ class _Campaign:
         self.reference = self._dataset("reference_configuration", 2, 3)
         if self.reference.shape[-2:] != (self.nodes, 3) or self.reference.shape[:-2] not in ((), (self.runs,)):
             raise self._wrong("reference_configuration", f"({self.runs}, {self.nodes}, 3)")
-        self.mesh_file = mesh
         self.faces = self._faces(mesh)
-        self.time = self._time()
+        self.time = self._time(step)
         self.parameters = self._parameters()
         self.numbers = self._numbers()
         self.alive = self._if_there("alive", (self.runs, self.states, len(self.faces)))
@@ -139,6 +143,8 @@ class _Campaign:
         self.fields = self._fields()
         self.curves = self._curves()
         self.left_out = self._left_out()
+        used = () if mesh is None or "faces" in self.file[self.group] else (mesh,)
+        self.files = (path, *used, *sorted(set().union(*self._behind.values())))
         unit = _text(self.displacements.attrs.get("units", ""))
         self.units = "SI" if unit in _METRE else None
 
@@ -239,6 +245,8 @@ class _Campaign:
                 f"{self.path}: {found.name} has shape {found.shape} and type {found.dtype}; "
                 f"expected numbers with {' or '.join(map(str, dimensions))} dimensions"
             )
+        if found.name not in self._behind:
+            self._behind[found.name] = files_behind(found, self.path)
         return found
 
     def _wrong(self, name: str, expected: str) -> ReadError:
@@ -250,7 +258,14 @@ class _Campaign:
         with reading(f"{self.path}, {dataset.name}{list(index)}"):
             return np.asarray(dataset[index])
 
-    def _time(self) -> NDArray[np.float64]:
+    def _time(self, step: float | None) -> NDArray[np.float64]:
+        there = "time" in self.file or "time" in self.file[self.group]
+        if not there and step is not None:
+            return np.broadcast_to(np.arange(self.states) * step, (self.runs, self.states))
+        if not there:
+            raise ReadError(f"{self.path}: no dataset time; give the time between two states (--time-step)")
+        if step is not None:
+            self.notes = (f"{self.path}: holds times of its own, so --time-step is not used",)
         time = self._dataset("time", 1, 2)
         if time.shape not in ((self.states,), (self.runs, self.states)):
             raise self._wrong("time", f"({self.states},) or ({self.runs}, {self.states})")
@@ -292,7 +307,8 @@ class _Campaign:
                 "expected as many of each"
             )
         rows = self.read(table, ...).astype(np.float64)
-        return [{n: Parameter(float(v), u) for n, v, u in zip(names, row, units, strict=True)} for row in rows]
+        columns = parameter_columns(names, units, f"{self.path}: {table.name}")
+        return [{n: Parameter(float(v), u) for (n, u), v in zip(columns, row, strict=True)} for row in rows]
 
     def _fields(self) -> dict[str, FieldInfo]:
         import h5py
@@ -310,6 +326,7 @@ class _Campaign:
             places = {self.nodes: "node", len(self.faces): "face"}
             place = _text(found.attrs.get("location", "")) or places.get(found.shape[2])
             if place in ("node", "face"):
+                self._dataset(name)  # its values are there, and known by their files
                 components = found.shape[3] if found.ndim == 4 else 1
                 fields[name] = FieldInfo(name, place, components, quantity(name))  # type: ignore[arg-type]
         return fields
@@ -322,7 +339,8 @@ class _KartRun(Run):
         self._campaign, self._index = campaign, index
         self.name = campaign.name(index)
         self.solver = _text(campaign.file.attrs.get("source", "")) or "unknown"
-        self.files = (campaign.path,) if campaign.mesh_file is None else (campaign.path, campaign.mesh_file)
+        self.files = campaign.files
+        self.notes = campaign.notes
         self.time = np.array(campaign.time[index])
         self.parameters: Mapping[str, Parameter] = campaign.parameters[index]
         self.fields: Mapping[str, FieldInfo] = campaign.fields

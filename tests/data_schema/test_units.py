@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from data_schema import UnknownUnits, si_unit, to_si, unit_system
+from data_schema.units import is_unit
 
 
 @pytest.mark.parametrize(
@@ -60,7 +61,30 @@ def test_unknown_quantity_is_told() -> None:
         ("t/mm3", 7.85e-9, (7850.0, "kg m-3")),
         ("deg", 30.0, (30.0, "degree")),
         ("", 3.0, (3.0, "1")),
-        ("bananas", 3.0, (3.0, "bananas")),
+        ("-", 3.0, (3.0, "1")),
+        ("psi", 1000.0, (6894757.293, "Pa")),
+        ("ksi", 1.0, (6894757.293, "Pa")),
+        ("ft/s", 10.0, (3.048, "m s-1")),
+        ("m/s^2", 2.0, (2.0, "m s-2")),
+        ("G", 2.0, (19.6133, "m s-2")),
+        ("KM/H", 36.0, (10.0, "m s-1")),
+        ("kph", 36.0, (10.0, "m s-1")),
+        ("inch", 2.0, (0.0508, "m")),
+        ("N/mm²", 210.0, (2.1e8, "Pa")),
+        ("N/mm^2", 210.0, (2.1e8, "Pa")),
+        ("MPA", 2.0, (2e6, "Pa")),
+        ("ton", 2.0, (2e3, "kg")),
+        ("g/cm^3", 7.85, (7850.0, "kg m-3")),
+        ("kN/mm", 1.0, (1e6, "N m-1")),
+        ("kNm", 2.0, (2e3, "N m")),
+        ("kJ", 2.0, (2e3, "J")),
+        ("kg*m²", 2.0, (2.0, "kg m2")),
+        ("1/s", 3.0, (3.0, "s-1")),
+        ("m·s⁻¹", 3.0, (3.0, "m s-1")),
+        ("°", 30.0, (30.0, "degree")),
+        ("°C", 20.0, (20.0, "degC")),
+        ("rad", 0.5, (0.5, "rad")),
+        ("%", 5.0, (5.0, "%")),
     ],
 )
 def test_parameter_units(unit: str, value: float, si: tuple[float, str]) -> None:
@@ -70,3 +94,23 @@ def test_parameter_units(unit: str, value: float, si: tuple[float, str]) -> None
 
 def test_si_units_by_quantity() -> None:
     assert (si_unit("stress"), si_unit("velocity"), si_unit("one")) == ("Pa", "m s-1", "1")
+
+
+@pytest.mark.parametrize("unit", ["bananas", "m/ss", "9**9**9", "m**999", "(", "10^3 N", "__import__('os')"])
+def test_a_unit_that_is_not_known_is_refused_with_the_cure(unit: str) -> None:
+    with pytest.raises(UnknownUnits, match=r"is not known; write one such as m/s, km/h, mm"):
+        to_si(unit)
+
+
+@pytest.mark.parametrize("label", ["m s-1", "Pa", "kg m-3", "degree", "degC", "rad", "N m", "1", "kg m2", "%"])
+def test_labels_stay_what_they_are(label: str) -> None:
+    assert to_si(label) == (1.0, label)
+
+
+@pytest.mark.parametrize("word", ["front", "rear", "left", "a", "b", "min", "max", "lhs", "mil", "no. 3"])
+def test_words_are_no_units(word: str) -> None:
+    assert not is_unit(word)
+
+
+def test_units_of_the_usual_kinds_are_known() -> None:
+    assert all(is_unit(unit) for unit in ("mm", "km/h", "MPa", "°", "psi", "-", "kN", "m s-1", "t/mm3"))
