@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from data_schema.units import to_si
+from data_schema.units import UnknownUnits, to_si
 
 Dimension = tuple[float, float, float]
 
@@ -18,9 +18,13 @@ _FACTOR = re.compile(r"([A-Za-z]+)(?:(?:\^|\*\*)?([-+]?\d+))?")
 
 def dimension(unit: str) -> Dimension | None:
     """Exponents of (kg, m, s) of a unit such as "m s-1" or "MPa"; None for angles, "1" and units that are not known."""
+    try:
+        label = to_si(unit)[1]
+    except UnknownUnits:
+        return None
     total = [0.0, 0.0, 0.0]
     sign = 1
-    for part in re.split(r"(/)", to_si(unit)[1]):
+    for part in re.split(r"(/)", label):
         if part == "/":
             sign = -1
             continue

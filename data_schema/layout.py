@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from data_schema.units import to_si
+from data_schema.units import UnknownUnits, to_si
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -219,7 +219,10 @@ def table_unit(dataset: xr.Dataset, name: str) -> tuple[str, float]:
     """
     attributes = dataset[name].attrs
     own, written = str(attributes.get("units", "")), str(attributes.get("table_units", ""))
-    factor, si = to_si(written)
+    try:
+        factor, si = to_si(written)
+    except UnknownUnits:
+        return own, 1.0
     return (written, factor) if written and si == own else (own, 1.0)
 
 

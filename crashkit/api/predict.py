@@ -121,16 +121,16 @@ def _value(name: str, given: float | str, unit: str) -> float:
         if found is None:
             raise DataError(f"{name}={given}: expected a number, with a unit if you like, such as {name}=1{unit}")
         value = float(found[1])
-        if found[2]:
+        if found[2] and found[2] != unit:
             try:
-                factor, si = to_si(found[2])
+                (factor, si), (own, label) = to_si(found[2]), to_si(unit)
             except UnknownUnits as error:
                 raise DataError(f"{name}={given}: {error}") from error
-            if si != to_si(unit)[1]:
+            if si != label:
                 raise DataError(
                     f"{name}={given}: the unit {found[2]!r} is not one of {name}, which is in {unit or 'no unit'}"
                 )
-            value *= factor / to_si(unit)[0]
+            value *= factor / own
     if not math.isfinite(value):
         raise DataError(f"{name}={given}: expected a finite number")
     return value

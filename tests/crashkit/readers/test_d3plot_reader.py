@@ -343,3 +343,111 @@ def _widen(source: Path, target: Path, floats: list[int]) -> None:
     raw += np.array([-999999.0], "<f8").tobytes()
     raw += bytes(-len(raw) % 4096)
     target.write_bytes(raw)
+
+
+@pytest.fixture
+def particles(data) -> Path:
+    """25 particles of part 101 above a wall that LS-DYNA drew as part 1, release 7: titles come with part numbers."""
+    return data("d3plot/sph_r7")
+
+
+def _retitle(file: Path, numbers: list[int], titles: list[str]) -> None:
+    """Write numbers and titles of the parts; they stand behind the word 90001 and their count."""
+    words = np.fromfile(file, "<i4")
+    start = 4 * (int(np.flatnonzero(words == 90001)[0]) + 2)
+    for k, (number, title) in enumerate(zip(numbers, titles, strict=True)):
+        overwrite(file, start + 76 * k, number, "<i4")
+        overwrite(file, start + 76 * k + 4, list(title.ljust(72).encode()), "u1")
+
+
+@pytest.mark.parametrize("release", ["r7", "r12"])
+def test_a_wall_that_ls_dyna_drew_is_one_in_every_release(data, only_run, release):
+    """Release 12 numbers titles 1, 2 in the order of the parts; release 7 writes the numbers of the parts."""
+    parts = only_run(data(f"d3plot/sph_{release}")).mesh.parts
+    assert [(p.id, p.name, p.rigid_wall) for p in parts] == [
+        (101, "part 101", False),
+        (1, "null shells for visualization", True),
+    ]
+
+
+def test_titles_by_position_and_by_number(data, only_run):
+    later, earlier = data("d3plot/sph_r12"), data("d3plot/sph_r7")
+    _retitle(later / "d3plot", [1, 2], ["front rail", "rigid wall"])
+    _retitle(earlier / "d3plot", [1, 101], ["rigid wall", "front rail"])
+    for folder in (later, earlier):
+        parts = only_run(folder).mesh.parts
+        assert [(p.id, p.name, p.rigid_wall) for p in parts] == [(101, "front rail", False), (1, "rigid wall", True)]
+
+
+def test_particles_die_by_the_sign_of_their_material(particles, only_run):
+    """The first word of a particle's block; the block stands behind the word that says whether the shell lives."""
+    run = only_run(particles)
+    assert run.alive_cells(0, 10).all()
+    words = 845
+    for state in (5, 6):
+        overwrite(particles / "d3plot01", 4 * (state * words + 320 + 21 * 3), -1.0)
+    alive = only_run(particles).alive_cells(0, 10)
+    assert np.argwhere(~alive).tolist() == [[5, 3], [6, 3]]
+
+
+def test_results_of_particles_equal_lasso(particles, only_run):
+    theirs = D3plot(str(particles / "d3plot")).arrays
+    run = only_run(particles)
+    for name, array in (("sph_pressure", "sph_pressure"), ("sph_density", "sph_density"), ("sph_mass", "sph_mass")):
+        np.testing.assert_array_equal(run.field(name, 0, 10), theirs[array])
+    np.testing.assert_array_equal(run.field("sph_stress", 0, 10), theirs["sph_stress"])
+    np.testing.assert_array_equal(run.field("sph_plastic_strain", 3, 4), theirs["sph_effective_plastic_strain"][3:4])
+    assert run.fields["sph_pressure"].quantity == "stress"
+
+
+def test_shells_with_strain_tensors_give_what_stands_before_them(particles, only_run):
+    """Plastic strain tensors of three surfaces (IDTDT = 100): 18 words more a shell than lasso-python can place."""
+    before = {n: only_run(particles).field(n, 0, 10) for n in ("stress", "plastic_strain", "thickness")}
+    moved = only_run(particles).displacement(0, 10)
+    state, behind_shell = 845, 286 + 33
+    overwrite(particles / "d3plot", 4 * 33, 33 + 18, "<i4")
+    overwrite(particles / "d3plot", 4 * 56, 100, "<i4")
+    for file in sorted(particles.glob("d3plot0*")):
+        words = np.fromfile(file, "<f4")
+        count = (int(np.flatnonzero(words)[-1]) + 1) // state
+        states, rest = words[: count * state].reshape(count, state), words[count * state :]
+        np.concatenate([np.insert(states, [behind_shell] * 18, 7.5, axis=1).ravel(), rest]).tofile(file)
+    run = only_run(particles)
+    assert not run.problems
+    for name, values in before.items():
+        np.testing.assert_array_equal(run.field(name, 0, 10), values)
+    np.testing.assert_array_equal(run.displacement(0, 10), moved)
+    with pytest.raises(
+        ReadError, match=r"strain tensors \(IDTDT = 100, asked for by STRFLG of \*DATABASE_EXTENT_BINARY\)"
+    ):
+        run.field("strain", 0, 1)
+    assert "strain" not in run.fields
+
+
+def test_d3part_is_left_aside_and_read_where_it_is_all_there_is(solids, only_run):
+    moved = only_run(solids).displacement(0, 5)
+    for file in sorted(solids.glob("d3plot*")):
+        shutil.copy(file, solids / file.name.replace("d3plot", "d3part"))
+    overwrite(solids / "d3part", 4 * 11, 5, "<i4")
+    runs = reader_for(solids).runs(solids)
+    assert runs.names == (solids.name,)
+    assert "d3part left aside, since d3plot is there" in runs.passed_over[0]
+    asked = only_run(solids / "d3part")
+    assert (asked.name, asked.files[0].name) == (solids.name, "d3part")
+    for file in sorted(solids.glob("d3plot*")):
+        file.unlink()
+    alone = only_run(solids)
+    assert (alone.name, alone.files[0].name) == (solids.name, "d3part")
+    np.testing.assert_array_equal(alone.displacement(0, 5), moved)
+
+
+def test_two_files_of_one_number_are_refused(solids):
+    shutil.copy(solids / "d3plot02", solids / "d3plot2")
+    with pytest.raises(ReadError, match="d3plot02 and d3plot2 have the same number"):
+        list(reader_for(solids).runs(solids))
+
+
+def test_a_family_that_femzip_packed_is_called_so(solids):
+    overwrite(solids / "d3plot", 4 * 51, 76_893_465, "<i4")
+    with pytest.raises(ReadError, match="is packed with FEMZIP, which needs a licence"):
+        list(reader_for(solids).runs(solids))

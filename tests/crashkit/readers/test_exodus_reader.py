@@ -140,3 +140,105 @@ def test_a_file_without_displacements_is_refused(written):
         file["name_nod_var"][:] = np.array([[c.encode() for c in f"TEMP_{k}".ljust(33, "\0")] for k in range(3)], "S1")
     with pytest.raises(ReadError, match="no point array called displacement"):
         next(reader_for(written).runs(written))
+
+
+def mesh_alone(path: Path, sample) -> Path:
+    """A mesh without states, as mesh generators write it beside the results."""
+    write_exodus(path, sample, "classic")
+    with netCDF4.Dataset(path) as file, netCDF4.Dataset(path.with_suffix(".new"), "w", format="NETCDF3_CLASSIC") as out:
+        for name, size in file.dimensions.items():
+            out.createDimension(name, None if name == "time_step" else len(size))
+        for name, variable in file.variables.items():
+            if not name.startswith(("vals", "name_", "time")):
+                copy = out.createVariable(name, variable.dtype, variable.dimensions)
+                copy.setncatts(variable.__dict__)
+                copy[:] = variable[:]
+    return path.with_suffix(".new").rename(path)
+
+
+def test_a_mesh_beside_results_is_left_aside(tmp_path, sample):
+    write_exodus(tmp_path / "kart.e", sample, "classic")
+    mesh_alone(tmp_path / "kart.g", sample)
+    runs = reader_for(tmp_path).runs(tmp_path)
+    assert runs.names == ("kart",)
+    assert "kart.g is left aside, it is a mesh without states" in runs.passed_over[0]
+    np.testing.assert_array_equal(next(runs).displacement(0, 3), sample.displacement)
+
+
+def test_two_results_of_one_stem_are_two_runs(tmp_path, sample):
+    for name in ("kart.e", "kart.exo", "kart.v2.e"):
+        write_exodus(tmp_path / name, sample, "hdf5")
+    assert reader_for(tmp_path).runs(tmp_path).names == ("kart.e", "kart.exo", "kart.v2")
+
+
+def test_a_mesh_that_was_refined_is_refused_with_both_names(tmp_path, sample):
+    for name in ("out.e", "out.e-s002"):
+        write_exodus(tmp_path / name, sample, "classic")
+    for path in (tmp_path, tmp_path / "out.e"):
+        with pytest.raises(ReadError, match=r"out\.e: goes on in out\.e-s002, so the mesh changes"):
+            list(reader_for(path).runs(path))
+
+
+def write_pieces(folder: Path, sample, *, maps: bool = True) -> list[Path]:
+    """The sample as two processors write it: faces 0 to 79 and 80 to 119, nodes on the border in both."""
+    files = []
+    for k, rows in enumerate((slice(0, 80), slice(80, 120))):
+        nodes = np.unique(sample.faces[rows])
+        files.append(folder / f"out.e.2.{k}")
+        with netCDF4.Dataset(files[-1], "w", format="NETCDF3_64BIT_OFFSET") as file:
+            sizes = {"time_step": None, "num_nodes": len(nodes), "num_el_blk": 1, "len_name": 33, "num_nod_var": 3}
+            sizes |= {"num_el_in_blk1": 120 - 80 if k else 80, "num_nod_per_el1": 3, "num_elem": 40 if k else 80}
+            for name, size in sizes.items():
+                file.createDimension(name, size)
+            file.createVariable("time_whole", "f8", ("time_step",))[:] = sample.time
+            file.createVariable("eb_prop1", "i4", ("num_el_blk",))[:] = [10]
+            if maps:
+                file.createVariable("node_num_map", "i4", ("num_nodes",))[:] = nodes + 1
+                file.createVariable("elem_num_map", "i4", ("num_elem",))[:] = np.arange(120)[rows] + 1
+            for axis, name in enumerate("xyz"):
+                file.createVariable(f"coord{name}", "f8", ("num_nodes",))[:] = sample.points[nodes, axis]
+                values = file.createVariable(f"vals_nod_var{axis + 1}", "f8", ("time_step", "num_nodes"))
+                values[:] = sample.displacement[:, nodes, axis]
+            titles = np.array([[c.encode() for c in f"disp_{n}".ljust(33, "\0")] for n in "xyz"], "S1")
+            file.createVariable("name_nod_var", "S1", ("num_nod_var", "len_name"))[:] = titles
+            joined = file.createVariable("connect1", "i4", ("num_el_in_blk1", "num_nod_per_el1"))
+            joined.elem_type = "TRI3"
+            joined[:] = np.searchsorted(nodes, sample.faces[rows]) + 1
+    return files
+
+
+def test_pieces_of_processors_are_joined_by_their_maps(tmp_path, sample):
+    files = write_pieces(tmp_path, sample)
+    for path in (tmp_path, files[1]):
+        (run,) = reader_for(path).runs(path)
+        assert run.name == "out"
+        np.testing.assert_array_equal(run.mesh.position, sample.points)
+        np.testing.assert_array_equal(run.mesh.face_nodes, sample.faces)
+        np.testing.assert_array_equal(run.displacement(0, 3), sample.displacement)
+        assert set(run.files) == set(files)
+
+
+def test_a_missing_piece_or_map_names_epu(tmp_path, sample):
+    files = write_pieces(tmp_path, sample)
+    files[0].unlink()
+    with pytest.raises(ReadError, match="of its 2 pieces number 0 is missing; join the whole run with epu"):
+        list(reader_for(tmp_path).runs(tmp_path))
+    write_pieces(tmp_path, sample, maps=False)
+    with pytest.raises(ReadError, match=r"has no node_num_map or elem_num_map; join the pieces with epu"):
+        list(reader_for(tmp_path).runs(tmp_path))
+
+
+def test_pieces_beside_the_joined_run_are_left_aside(tmp_path, sample):
+    write_pieces(tmp_path, sample)
+    write_exodus(tmp_path / "out.e", sample, "classic")
+    runs = reader_for(tmp_path).runs(tmp_path)
+    assert runs.names == ("out",)
+    assert "the pieces out.e.2.* are left aside, since out.e is there" in runs.passed_over[0]
+
+
+def test_zeros_behind_a_classic_file_are_no_damage(tmp_path, sample, only_run):
+    path = write_exodus(tmp_path / "run.e", sample, "classic")
+    path.write_bytes(path.read_bytes() + bytes(512))
+    assert only_run(path).problems == ()
+    path.write_bytes(path.read_bytes() + b"\1" * 8)
+    assert "bytes behind its last variable" in only_run(path).problems[0]

@@ -216,3 +216,118 @@ def test_runs_numbered_twice_are_refused(whole):
         file["run"][...] = [5, 5]
     with pytest.raises(ReadError, match="twice"):
         read(whole)
+
+
+def table(path: Path, names: list[str], units: list[str] | None = None) -> None:
+    with h5py.File(path, "a") as file:
+        del file["parameter"]
+        file["parameter"] = np.arange(2.0 * len(names)).reshape(2, -1)
+        file["parameter"].attrs["names"] = names
+        if units is not None:
+            file["parameter"].attrs["units"] = units
+
+
+def test_names_of_parameters_are_cleaned_and_their_units_read(campaign):
+    table(campaign, ["speed [km/h]", "v/v0", "t (front)", " angle "], ["", "1", "mm", "degree"])
+    assert read(campaign)[1].parameters == {
+        "speed": Parameter(4.0, "km/h"),
+        "v_v0": Parameter(5.0, "1"),
+        "t_front": Parameter(6.0, "mm"),
+        "angle": Parameter(7.0, "degree"),
+    }
+
+
+@pytest.mark.parametrize(
+    ("names", "told"),
+    [
+        (["speed", "speed"], "columns 'speed' and 'speed' would both be parameter speed"),
+        (["v/v0", "v v0"], "columns 'v/v0' and 'v v0' would both be parameter v_v0"),
+        (["speed", ""], "'' is no name of a parameter"),
+        (["..", "b"], "'..' is no name of a parameter"),
+        (["a" * 300, "b"], "has 300 letters; expected at most 100"),
+    ],
+)
+def test_names_of_parameters_that_cannot_be_are_refused(campaign, names, told):
+    table(campaign, names)
+    with pytest.raises(ReadError, match=told):
+        read(campaign)
+
+
+def test_times_come_from_the_option_where_the_file_has_none(campaign):
+    with h5py.File(campaign, "a") as file:
+        del file["time"]
+    with pytest.raises(ReadError, match="no dataset time; give the time between two states"):
+        read(campaign)
+    assert read(campaign, time_step=0.5)[1].time.tolist() == [0.0, 0.5, 1.0]
+
+
+def _unwritten(file: h5py.File) -> None:
+    del file["kart/displacements"]
+    file.create_dataset("kart/displacements", (2, 3, 162, 3), "f4", chunks=(1, 1, 162, 3))[0] = 1.0
+
+
+def _never(file: h5py.File) -> None:
+    del file["kart/displacements"]
+    file.create_dataset("kart/displacements", (2, 3, 162, 3), "f4")
+
+
+def _virtual(name: str):
+    def make(file: h5py.File) -> None:
+        del file["kart/displacements"]
+        layout = h5py.VirtualLayout((2, 3, 162, 3), "f4")
+        layout[0] = h5py.VirtualSource(name, "u", (3, 162, 3))
+        if "half" not in name:
+            layout[1] = h5py.VirtualSource(name, "u", (3, 162, 3))
+        file.create_virtual_dataset("kart/displacements", layout)
+
+    return make
+
+
+def _raw(file: h5py.File) -> None:
+    del file["kart/displacements"]
+    file.create_dataset("kart/displacements", (2, 3, 162, 3), "f4", external=[("raw.bin", 0, h5py.h5f.UNLIMITED)])
+
+
+def _outside(file: h5py.File) -> None:
+    del file["kart/displacements"]
+    file["kart/displacements"] = h5py.ExternalLink("../elsewhere.h5", "both")
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (_unwritten, "3 of its 6 chunks were never written"),
+        (_never, "its values were never written"),
+        (_virtual("nowhere.h5"), "takes values from nowhere.h5, which is not there"),
+        (_virtual("half.h5"), "of its 2916 values are in none of its sources"),
+        (_raw, "as raw bytes, which is not read; repack it"),
+        (_outside, "outside the folder of the file; copy it there"),
+    ],
+)
+def test_values_that_are_absent_are_refused_instead_of_zero(campaign, sample, tmp_path, change, told):
+    folder = tmp_path / "source"
+    folder.mkdir()
+    path = campaign.rename(folder / "runs.h5")
+    for name in ("elsewhere.h5", "source/half.h5"):
+        with h5py.File(tmp_path / name, "w") as file:
+            file["u"], file["both"] = sample.displacement, np.stack([sample.displacement] * 2)
+    with h5py.File(path, "a") as file:
+        change(file)
+    with pytest.raises(ReadError, match=told):
+        read(path)
+
+
+@pytest.mark.parametrize("link", [True, False])
+def test_files_behind_links_and_virtual_datasets_are_sources(campaign, sample, tmp_path, link):
+    beside = tmp_path / "values.h5"
+    with h5py.File(beside, "w") as file:
+        file["u"], file["both"] = sample.displacement, np.stack([sample.displacement] * 2)
+    with h5py.File(campaign, "a") as file:
+        if link:
+            del file["kart/displacements"]
+            file["kart/displacements"] = h5py.ExternalLink("values.h5", "both")
+        else:
+            _virtual("values.h5")(file)
+    run = read(campaign)[1]
+    np.testing.assert_array_equal(run.displacement(0, 3), sample.displacement)
+    assert {f.name for f in run.files} == {"runs.h5", "values.h5"}

@@ -325,3 +325,25 @@ def test_bytes_behind_the_end_are_a_problem(every_section, only_run):
         file = every_section / f"carA00{number}"
         file.write_bytes(file.read_bytes() + b"\0" * 8)
     assert "8 bytes behind byte" in only_run(every_section).problems[0]
+
+
+def test_a_file_made_to_fill_the_memory_is_refused(run_b, only_run):
+    """Zeros behind the content grow a thousandfold; they are not unpacked, and are said."""
+    first = sorted(run_b.glob("kartA*.gz"))[0]
+    whole = gzip.decompress(first.read_bytes())
+    first.write_bytes(gzip.compress(whole + bytes(200 << 20), 9))
+    run = only_run(run_b)
+    assert "bytes behind byte" in run.problems[0]
+    assert run._content(0).held < len(whole) + (2 << 20)
+    # The header itself may ask for it: 2e9 nodes in a file of some kilobytes.
+    header = bytearray(whole)
+    header[251 + 40 : 251 + 44] = (150_000_000).to_bytes(4, "big")
+    first.write_bytes(gzip.compress(bytes(header) + bytes(200 << 20), 9))
+    with pytest.raises(ReadError, match="which no result does; the file is damaged or was made to fill the memory"):
+        only_run(run_b)
+
+
+def test_two_files_of_one_number_are_refused(plain):
+    shutil.copy(plain / "kartA001", plain / "kartA0001")
+    with pytest.raises(ReadError, match="kartA0001 and kartA001 have the same number"):
+        list(reader_for(plain).runs(plain))
