@@ -9,13 +9,15 @@ import contextlib
 import importlib.util
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import xarray as xr
 
 import crashkit.accessor  # noqa: F401  registers `.crash`
+from crashkit.chunks import RUNS_WITH, damaged_chunk, lost_chunks
 from crashkit.errors import CrashkitError, ReadError
+from crashkit.netcdf import open_netcdf
 from data_schema import VARIABLES
 from data_schema import dataset_checksum as _checksum_from
 from data_schema.checksum import digests_of_run, run_checksum
@@ -44,11 +46,13 @@ def open_dataset(path: str | Path, *, chunks: Literal["stored"] | Mapping[str, i
     is_folder = path.is_dir()
     if is_folder and not (path / "zarr.json").exists():
         raise ReadError(f"{path}: is a folder, but no Zarr store; expected a dataset made by crashkit ingest")
-    options: dict[str, Any] = {"engine": "zarr", "consolidated": False} if is_folder else {"engine": "netcdf4"}
     if chunks == "stored":
         chunks = {} if importlib.util.find_spec("dask") else None
     try:
-        dataset = xr.open_dataset(path, chunks=chunks, **options)
+        if is_folder:
+            dataset = xr.open_dataset(path, chunks=chunks, engine="zarr", consolidated=False)
+        else:
+            dataset = open_netcdf(path, chunks=chunks)
     except Exception as error:  # what a damaged file raises is up to the libraries below
         raise ReadError(
             f"{path}: cannot be opened as a dataset ({_one_line(error)}); expected one made by crashkit ingest"
@@ -61,6 +65,12 @@ def open_dataset(path: str | Path, *, chunks: Literal["stored"] | Mapping[str, i
             + ("; it is damaged" if "displacement" in dataset.variables else "")
         )
     with reading(path):
+        lost = lost_chunks(path, [str(name) for name in dataset["sim"].values]) if is_folder else []
+        if lost:
+            dataset.close()
+            raise ReadError(f"{path}: {lost[0]}; copy the dataset again, or ingest the run again")
+        for variable in dataset.variables.values():
+            variable.attrs.pop(RUNS_WITH, None)  # of the store, not of what it holds
         out = dataset.assign({n: _as_text(v) for n, v in dataset.variables.items() if v.dtype.kind in "OT"})
     out.set_close(dataset.close)
     return out
@@ -74,9 +84,20 @@ def reading(path: str | Path) -> Iterator[None]:
     except (CrashkitError, MemoryError):
         raise
     except Exception as error:
-        raise ReadError(
-            f"{path}: cannot be read ({_one_line(error)}); it is damaged: copy or ingest it again"
-        ) from error
+        found = _damage(Path(path)) or f"cannot be read ({_one_line(error)}); it is damaged"
+        raise ReadError(f"{path}: {found}; copy the dataset again, or ingest the run again") from error
+
+
+def _damage(path: Path) -> str | None:
+    """Which run and chunk of a Zarr folder is damaged, if that can be told."""
+    if not path.is_dir():
+        return None
+    try:
+        with xr.open_dataset(path, engine="zarr", consolidated=False, chunks=None) as dataset:
+            runs = [str(name) for name in dataset["sim"].values]
+    except Exception:  # the names themselves are damaged
+        runs = []
+    return damaged_chunk(path, runs)
 
 
 def _as_text(variable: xr.Variable) -> xr.Variable:

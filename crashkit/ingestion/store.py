@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from crashkit.chunks import KEYS, RUNS_WITH, codecs
 from crashkit.errors import OutputError
 from data_schema.checksum import block_length
 
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
 SUFFIXES = (".zarr", ".nc")
-_KEYS: Any = {"name": "default", "separator": "."}  # one folder an array, not one a chunk
 
 
 @dataclass(frozen=True)
@@ -82,21 +82,20 @@ def check_output(output: Path) -> None:
 def create_arrays(store: Path, specs: Sequence[ArraySpec], runs: int) -> dict[str, Any]:
     """A new Zarr store with empty arrays (sim, ...) for `runs` runs, by name."""
     import zarr
-    from zarr.codecs import BloscCodec
 
     group = zarr.open_group(str(store), mode="w")
     out = {}
     for spec in specs:
-        # LZ4 behind a byte shuffle keeps pace with the disk; what compresses better writes at half the speed or less.
         out[spec.name] = group.create_array(
             spec.name,
             shape=(runs, *spec.shape),
             chunks=(1, *spec.chunks),
             dtype=spec.dtype,
             fill_value=spec.fill,
-            compressors=BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"),
+            compressors=codecs(),
+            config={"write_empty_chunks": True},
             dimension_names=("sim", *spec.dims),
-            chunk_key_encoding=_KEYS,
+            chunk_key_encoding=KEYS,
             attributes=dict(spec.attributes),
         )
     return out
@@ -112,9 +111,13 @@ def write_zarr(target: Path, small: xr.Dataset, specs: Sequence[ArraySpec], runs
     create_arrays(target, specs, len(runs))
     for spec in specs:
         chunks = {store: _chunks_of_runs(store / spec.name) for store in {source.store for source in runs}}
-        for place, source in enumerate(runs):
-            for chunk in chunks[source.store].get(source.place, ()):
+        having = [place for place, source in enumerate(runs) if chunks[source.store].get(source.place)]
+        for place in having:
+            source = runs[place]
+            for chunk in chunks[source.store][source.place]:
                 _link(chunk, target / spec.name / f"c.{place}.{chunk.name.split('.', 2)[2]}")
+        if len(having) < len(runs):
+            zarr.open_array(str(target / spec.name), mode="r+").attrs[RUNS_WITH] = json.dumps(having)
     group = zarr.open_group(str(target), mode="r+")
     for name, variable in small.variables.items():
         values = variable.values
@@ -126,7 +129,9 @@ def write_zarr(target: Path, small: xr.Dataset, specs: Sequence[ArraySpec], runs
             dtype=str if text else values.dtype,
             dimension_names=tuple(map(str, variable.dims)),
             fill_value=np.nan if values.dtype.kind == "f" else None,
-            chunk_key_encoding=_KEYS,
+            compressors=codecs(),
+            config={"write_empty_chunks": True},
+            chunk_key_encoding=KEYS,
             attributes=_coordinates_named(small, str(name), variable.attrs),
         )
         array[...] = values.astype(object) if text else values
@@ -214,7 +219,13 @@ def _create(
     else:
         options: dict[str, Any] = {"fill_value": np.nan} if dtype.kind == "f" else {}
         if dims:
-            options |= {"compression": "zlib", "complevel": 1, "shuffle": True, "chunksizes": chunks}
+            options |= {
+                "compression": "zlib",
+                "complevel": 1,
+                "shuffle": True,
+                "chunksizes": chunks,
+                "fletcher32": True,
+            }
         variable = out.createVariable(name, "i1" if dtype.kind == "b" else dtype, dims, **options)
     if dtype.kind == "b":
         attributes["dtype"] = "bool"  # how xarray remembers what NetCDF has no type for

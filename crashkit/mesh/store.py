@@ -22,10 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from crashkit.chunks import KEYS, codecs
 from crashkit.dataset import open_dataset, reading
 from crashkit.errors import DataError, OutputError, ReadError
 from crashkit.mesh.levels import Hierarchy
 from crashkit.mesh.lifting import LiftingError, LiftingMeter
+from crashkit.netcdf import handle, open_netcdf
 from crashkit.readers.base import split_states
 from data_schema.levels import Level
 
@@ -212,12 +214,14 @@ def _open_group(path: Path, name: str) -> Iterator[xr.Dataset]:
     """A group of the dataset at `path`; raises DataError if it is not there."""
     import xarray as xr
 
-    options: dict[str, Any] = {"engine": "zarr", "consolidated": False} if path.is_dir() else {"engine": "netcdf4"}
     try:
-        group = xr.open_dataset(path, group=name, chunks=None, **options)
+        if path.is_dir():
+            group = xr.open_dataset(path, group=name, chunks=None, engine="zarr", consolidated=False)
+        else:
+            group = open_netcdf(path, name)
     except (OSError, KeyError, ValueError) as error:  # what a missing group raises depends on the library below
         raise DataError(f"{path}: has no group /{name}; run crashkit coarsen {path} again") from error
-    with group:
+    with group, reading(path):
         yield group
 
 
@@ -344,16 +348,18 @@ class _ZarrTarget:
 
     def array(self, group: str, name: str, dims: tuple[str, ...], values: NDArray, attributes: dict[str, Any]) -> None:
         array = self._root.require_group(group).create_array(
-            name, data=np.ascontiguousarray(values), dimension_names=dims
-        )
+            name, data=np.ascontiguousarray(values), dimension_names=dims, compressors=codecs(),
+            config={"write_empty_chunks": True}, chunk_key_encoding=KEYS,
+        )  # fmt: skip
         array.attrs.update(attributes)
 
     def stream(
         self, group: str, name: str, dims: tuple[str, ...], shape: tuple[int, ...], attributes: dict[str, Any]
     ) -> Callable[[int, int, int, NDArray], None]:
         array = self._root.require_group(group).create_array(
-            name, shape=shape, chunks=(1, *shape[1:]), dtype="float32", fill_value=np.nan, dimension_names=dims
-        )
+            name, shape=shape, chunks=(1, *shape[1:]), dtype="float32", fill_value=np.nan, dimension_names=dims,
+            compressors=codecs(), config={"write_empty_chunks": True}, chunk_key_encoding=KEYS,
+        )  # fmt: skip
         array.attrs.update(attributes)
 
         def write(run: int, begin: int, end: int, block: NDArray) -> None:
@@ -393,7 +399,9 @@ class _NetcdfTarget:
             if dim not in home.dimensions and dim not in self._root.dimensions:
                 home.createDimension(dim, size)
         options: dict[str, Any] = {"fill_value": np.nan} if dtype.kind == "f" else {}
-        variable = home.createVariable(name, dtype, dims, compression="zlib", complevel=1, chunksizes=chunks, **options)
+        variable = home.createVariable(
+            name, dtype, dims, compression="zlib", complevel=1, chunksizes=chunks, fletcher32=True, **options
+        )
         variable.setncatts(attributes)
         return variable
 
@@ -437,7 +445,7 @@ def _copy_without_hierarchy(path: Path, copy: Path) -> None:
     """A copy of a NetCDF file; HDF5 gives no space back, so an older hierarchy is left out by copying around it."""
     import netCDF4
 
-    with netCDF4.Dataset(str(path)) as source:
+    with handle(path) as source:
         if "hierarchy" in source.groups:
             with netCDF4.Dataset(str(copy), "w") as target:
                 _copy_netcdf(source, target, leave_out="hierarchy")
@@ -454,7 +462,7 @@ def _copy_netcdf(source: Any, target: Any, leave_out: str = "") -> None:
         chunks = variable.chunking()
         filters = variable.filters() or {}
         options: dict[str, Any] = {"zlib": True, "complevel": filters["complevel"]} if filters.get("zlib") else {}
-        options |= {"shuffle": bool(filters.get("shuffle"))} if options else {}
+        options |= {name: bool(filters.get(name)) for name in ("shuffle", "fletcher32")} if options else {}
         new = target.createVariable(
             name, variable.dtype, variable.dimensions, fill_value=attributes.pop("_FillValue", None),
             chunksizes=None if chunks == "contiguous" or not variable.dimensions else chunks, **options,
@@ -484,9 +492,7 @@ def has_hierarchy(path: str | Path) -> bool:
     path = Path(path)
     if path.is_dir():
         return (path / "hierarchy").is_dir()
-    import netCDF4
-
-    with netCDF4.Dataset(str(path)) as file:
+    with handle(path) as file:
         return "hierarchy" in file.groups
 
 

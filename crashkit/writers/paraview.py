@@ -173,13 +173,13 @@ def read_state(path: str | os.PathLike[str], state: int = -1) -> tuple[float, An
 
 
 def rounded(values: NDArray[np.floating], size: float) -> NDArray[np.float32]:
-    """`values` to about 1/65000 of `size`, both in m, as single precision numbers that compress to two thirds.
+    """`values` to about 1/40000 of `size`, both in m, as single precision numbers that compress to two thirds.
 
     Predictions carry noise in their last digits, far below their error, which takes most of the space in a file.
     """
     if not size > 0:
         return np.asarray(values, np.float32)
-    step = np.float32(2.0 ** np.floor(np.log2(2e-5 * size)))
+    step = np.float32(2.0 ** np.floor(np.log2(5e-5 * size)))
     return np.round(np.asarray(values, np.float32) / step) * step
 
 

@@ -35,7 +35,8 @@ def write_run(evaluation: Evaluation, run: int, folder: Path, formats: Sequence[
     """Write run number `run` with the predictions of all models into `folder`, as `.pvd` with VTU or as `.vtkhdf`.
 
     `RUN` stands on the full mesh. Its arrays are displacement (true); predicted_MODEL and the distance from the truth,
-    error_MODEL, of every model; contribution_LEVEL of a cascade; coarsest_level, the coarsest level that keeps a node
+    error_MODEL, of every model; contribution_LEVEL of a cascade, but for the coarsest level's, which is what the others
+    leave of the prediction; coarsest_level, the coarsest level that keeps a node
     (0 for none); the fields that were ingested; numbers of nodes, elements and parts. Parameters and names of parts and
     models are field data. `RUN_MODEL_levelN` is the coarse mesh of level N with its own prediction. Predictions are
     rounded far below their error (`crashkit.writers.paraview.rounded`).
@@ -122,7 +123,7 @@ def _write_full(
             out[f"predicted_{finest}"] = rounded(lifted[finest], size)
             out[f"error_{finest}"] = rounded(_distance(lifted[finest], truth[states]), size)
             if len(lifted) > 1:
-                added = contributions(lifted)
+                added = dict(list(contributions(lifted).items())[1:])  # the coarsest level's is what remains
                 out |= {f"contribution_{name}": rounded(field, size) for name, field in added.items()}
         return out
 
