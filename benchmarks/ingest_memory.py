@@ -135,7 +135,8 @@ def raw(folder: Path, runs: int, args: argparse.Namespace) -> dict[str, Any]:
     """One run, written again and again into a store of the same kind."""
     import zarr  # noqa: F401
 
-    from crashkit.ingestion.store import ArraySpec, create_arrays, put_in_place
+    from crashkit.ingestion.store import ArraySpec, create_arrays
+    from data_schema.replace import put_in_place
 
     values = tiled_states(COPIES * len(kart()[0]))
     spec = ArraySpec("displacement", ("time", "node", "xyz"), values.shape, "float32")
@@ -145,7 +146,7 @@ def raw(folder: Path, runs: int, args: argparse.Namespace) -> dict[str, Any]:
     array = create_arrays(folder / "raw.new", [spec], runs)["displacement"]
     for run in range(runs):
         array[run] = values
-    put_in_place(folder / "raw.new", output)
+    put_in_place(folder / "raw.new", output, durable=True)
     seconds = perf_counter() - begin
     return {
         "seconds": seconds, "bytes": runs * values.nbytes, "nodes": values.shape[1], "peak": peak(), "stored": size(output),

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import re
-import shutil
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 from crashkit.errors import OutputError
+from data_schema.replace import beside
 
 
 def refuse_earlier(output: Path, mark: str, what: str, option: str = "-o") -> None:
@@ -39,26 +38,19 @@ def complete_folder(output: Path, mark: str) -> Iterator[Path]:
             f"{output}: exists and holds no {mark}; expected a new folder, or an earlier result to replace"
         )
     try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(dir=output.parent, prefix=f".{output.name}-", suffix=".partial"))
-    except OSError as error:
-        raise OutputError(
-            f"{output}: no folder can be made there ({error.strerror or error}); choose another with -o"
-        ) from error
-    try:
-        yield partial
-        partial.chmod(0o755)
-        old = partial.with_suffix(".old")
-        if output.exists():
-            output.replace(old)
-        partial.replace(output)
-        shutil.rmtree(old, ignore_errors=True)
+        with contextlib.ExitStack() as stack:
+            try:
+                new = stack.enter_context(beside(output))
+                new.mkdir()
+            except OSError as error:
+                raise OutputError(
+                    f"{output}: no folder can be made there ({error.strerror or error}); choose another with -o"
+                ) from error
+            yield new
     except OSError as error:
         raise OutputError(
             f"{output}: cannot be written ({error.strerror or error}); check permissions and free space"
         ) from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def file_name(name: str) -> str:

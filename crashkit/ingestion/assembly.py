@@ -24,6 +24,7 @@ from crashkit.readers.base import Part
 from crashkit.version import __version__
 from data_schema import CONVENTIONS, dataset_checksum, digests_of_run, parameters, run_checksum, validate
 from data_schema import fields as fields_of
+from data_schema.replace import put_in_place, remove
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -135,9 +136,9 @@ def publish(
     runs = [RunSource(staging.place(staged[n].key), 0) if n in new else RunSource(kept_in, before[n]) for n in names]
     small = _small(layout, names, new, staged, old, runs, hashes)
     write = store.write_netcdf if staging.output.suffix == ".nc" else store.write_zarr
-    store.remove(staging.whole)
+    remove(staging.whole)
     write(staging.whole, small, specs, runs)
-    store.put_in_place(staging.whole, staging.output)
+    put_in_place(staging.whole, staging.output, durable=True)
     return names
 
 
@@ -148,7 +149,7 @@ def _kept_store(staging: Staging, old: Existing, specs: Sequence[ArraySpec]) -> 
     if old.path.is_dir() and store.same_layout(old.path, specs):
         return old.path
     copy = staging.folder / "whole-before.zarr"
-    store.remove(copy)
+    remove(copy)
     with open_dataset(old.path, chunks=None) as dataset:
         store.zarr_from(dataset, specs, copy)
     return copy

@@ -7,12 +7,10 @@ store into another as hard links.
 
 from __future__ import annotations
 
-import ctypes
 import errno
 import json
 import os
 import shutil
-import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -26,6 +24,7 @@ from numpy.typing import NDArray
 from crashkit.chunks import KEYS, RUNS_WITH, codecs
 from crashkit.errors import OutputError
 from data_schema.checksum import block_length
+from data_schema.replace import set_aside
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -278,72 +277,8 @@ def zarr_from(dataset: xr.Dataset, specs: Sequence[ArraySpec], target: Path) -> 
 # --- putting in place --------------------------------------------------------------------------------------------
 
 
-def put_in_place(new: Path, output: Path) -> None:
-    """Make `new` the dataset `output`; what stood there is gone afterwards. `new` is on the disk before.
-
-    A file, and a folder that was not there, appears in one step. A folder that was there is exchanged in one step
-    where the system can do that (Linux); elsewhere it is first set aside, and `recover` brings it back if the
-    process dies in between.
-    """
-    _synchronise(new)
-    if not output.is_dir():
-        new.replace(output)
-    elif not _exchange(new, output):
-        output.replace(_aside(new, output))
-        new.replace(output)
-    _synchronise_folder(output.absolute().parent)
-    for left in (_aside(new, output), new):
-        remove(left)
-
-
 def recover(staging: Path, output: Path) -> None:
     """Bring back a dataset that was set aside when the process died."""
-    aside = staging / f"replaced{output.suffix}"
+    aside = set_aside(staging / "whole", output)
     if aside.exists() and not output.exists():
         aside.replace(output)
-
-
-def remove(path: Path) -> None:
-    """Delete a file or folder if it is there."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
-
-
-def _aside(new: Path, output: Path) -> Path:
-    return new.with_name(f"replaced{output.suffix}")
-
-
-def _exchange(one: Path, other: Path) -> bool:
-    """Let two folders change places in one step; False where the system cannot."""
-    if not sys.platform.startswith("linux"):
-        return False
-    here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE of renameat2(2)
-    try:
-        rename = ctypes.CDLL(None, use_errno=True).renameat2
-    except AttributeError:  # a C library from before 2018
-        return False
-    return rename(here, os.fsencode(one), here, os.fsencode(other), ctypes.c_uint(exchange)) == 0
-
-
-def _synchronise(path: Path) -> None:
-    """Have everything under `path` on the disk, so that a power cut after the renaming finds it whole."""
-    files = [path] if path.is_file() else [Path(folder) / f for folder, _, names in os.walk(path) for f in names]
-    for file in files:
-        handle = os.open(file, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
-    if path.is_dir():
-        for folder, _, _ in os.walk(path):
-            _synchronise_folder(Path(folder))
-
-
-def _synchronise_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

@@ -31,6 +31,7 @@ from crashkit.ingestion.survey import Choice, Field, Found, reopen
 from crashkit.readers.base import Run, split_states
 from data_schema import unit_system
 from data_schema.checksum import BlockDigest, array_digest, block_digest
+from data_schema.replace import put_in_place
 from data_schema.validation import FIRST_STATE_TOLERANCE
 
 # A run's states are turned in memory up to this size, and in a file above.
@@ -116,8 +117,7 @@ def transfer(found: Found, layout: Layout, key: str, place: Path) -> StagedRun:
             write_curves(run, found.units, beside / "arrays")
         finally:
             run.close()
-        shutil.rmtree(place, ignore_errors=True)
-        (beside / "arrays").replace(place)
+        put_in_place(beside / "arrays", place)
     finally:
         shutil.rmtree(beside, ignore_errors=True)
     return StagedRun(key, found.name, digests, error)

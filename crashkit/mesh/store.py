@@ -30,6 +30,7 @@ from crashkit.mesh.lifting import LiftingError, LiftingMeter
 from crashkit.netcdf import handle, open_netcdf
 from crashkit.readers.base import split_states
 from data_schema.levels import Level
+from data_schema.replace import beside, put_in_place, room_beside
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -409,31 +410,25 @@ class _NetcdfTarget:
 @contextmanager
 def _target(path: Path) -> Iterator[_Target]:
     """Somewhere to write /hierarchy; taken over into the dataset at the end, thrown away on failure."""
-    beside = path.with_name(f".{path.name}.coarsen")
-    _remove(beside)
-    try:
-        if path.is_dir():
-            yield _ZarrTarget(beside)
-            _move_zarr_group(beside / "hierarchy", path)
-        else:
-            _copy_without_hierarchy(path, beside)
-            target = _NetcdfTarget(beside)
+    if path.is_dir():
+        with room_beside(path) as room:
+            yield _ZarrTarget(room)
+            put_in_place(room / "hierarchy", path / "hierarchy", durable=True)
+        _consolidate_again(path)
+    else:
+        with beside(path, durable=True) as new:
+            _copy_without_hierarchy(path, new)
+            target = _NetcdfTarget(new)
             try:
                 yield target
             finally:
                 target.close()
-            beside.replace(path)
-    finally:
-        _remove(beside)
 
 
-def _move_zarr_group(group: Path, path: Path) -> None:
+def _consolidate_again(path: Path) -> None:
+    """Renew the metadata of all groups in one file, where the store has them."""
     import zarr
 
-    home, old = path / "hierarchy", group.with_name("replaced")
-    if home.exists():
-        home.rename(old)
-    group.rename(home)
     if zarr.open_group(str(path), mode="r").metadata.consolidated_metadata is not None:
         with warnings.catch_warnings():
             # Zarr warns that version 3 does not specify what xarray has put there already.
@@ -478,13 +473,6 @@ def _copy_netcdf(source: Any, target: Any, leave_out: str = "") -> None:
     for name, group in source.groups.items():
         if name != leave_out:
             _copy_netcdf(group, target.createGroup(name))
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
 
 
 def has_hierarchy(path: str | Path) -> bool:

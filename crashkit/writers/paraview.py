@@ -13,8 +13,6 @@ several times slower (benchmarks/paraview.py).
 from __future__ import annotations
 
 import os
-import shutil
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -28,6 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from crashkit.errors import DataError, OutputError, ReadError
 from crashkit.writers.paraview_view import Ranges, view_script
+from data_schema.replace import put_in_place, room_beside
 
 if TYPE_CHECKING:
     import h5py
@@ -380,12 +379,12 @@ def _write(
             write = _xml_writer(mesh, constant, extras, polydata=suffix == ".vtp")
             for state, points in steps:
                 write(folder / target.name, float(times[0]), state, points)
-            (folder / target.name).replace(target)
+            put_in_place(folder / target.name, target)
             return [target]
-        (folder / target.name).replace(target)
+        put_in_place(folder / target.name, target)
         script = target.with_name(f"{target.stem}_view.py")
         (folder / script.name).write_text(view_script(target.name, ranges, extras.units), encoding="utf-8")
-        (folder / script.name).replace(script)
+        put_in_place(folder / script.name, script)
     return [target, *others, script]
 
 
@@ -399,16 +398,11 @@ def _followed(steps: _Steps, ranges: Ranges) -> _Steps:
 @contextmanager
 def _output(target: Path) -> Iterator[Path]:
     """A folder beside `target` to write into, gone afterwards; failures of the file system as OutputError."""
-    folder = None
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        folder = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
-        yield folder
+        with room_beside(target) as folder:
+            yield folder
     except OSError as error:
         raise OutputError(f"{target}: cannot be written: {error.strerror or error}; choose another place") from error
-    finally:
-        if folder is not None:
-            shutil.rmtree(folder, ignore_errors=True)
 
 
 # --- PVD, VTU and VTP through VTK ------------------------------------------------------------------------------
@@ -439,9 +433,7 @@ def _write_pvd(
         ElementTree.SubElement(collection, "DataSet", entry)
     ElementTree.indent(root)
     ElementTree.ElementTree(root).write(folder / target.name, encoding="utf-8", xml_declaration=True)
-    if place.exists():
-        place.rename(folder / "replaced")
-    written.rename(place)
+    put_in_place(written, place)
     return [place / name for name in names]
 
 

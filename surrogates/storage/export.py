@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from data_schema.replace import beside
 from surrogates.errors import SurrogateError
 from surrogates.models.base import Network
 from surrogates.operators.convolutions import exportable
@@ -66,9 +67,7 @@ def export(surrogate: Surrogate, path: str | Path, level: int | None = None, *, 
     parameters, time = _probes(surrogate, _batch_unlike(program))
     states = surrogate.predict_full if full else surrogate.predict
     wanted = np.stack([states(p, t[None], number)[0] for p, t in zip(parameters, time, strict=True)])
-    beside = path.with_name(f".{path.name}.part{path.suffix}")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
+    with beside(path) as new:
         with exportable(program), _quiet(), torch.no_grad():
             exported = torch.export.export(
                 program,
@@ -78,15 +77,12 @@ def export(surrogate: Surrogate, path: str | Path, level: int | None = None, *, 
                     "time": {0: torch.export.Dim("batch", min=1)},
                 },
             )
-            found = (_write_onnx if path.suffix == ".onnx" else _write_program)(exported, beside, parameters, time)
+            found = (_write_onnx if path.suffix == ".onnx" else _write_program)(exported, new, parameters, time)
         error = float(np.abs(found - wanted).max() / (np.abs(wanted).max() or 1.0))
         if not error <= TOLERANCE:
             raise SurrogateError(
                 f"{path}: the exported model differs by {error:.1e} of the largest displacement; not kept"
             )
-        beside.replace(path)
-    finally:
-        beside.unlink(missing_ok=True)
     return error
 
 

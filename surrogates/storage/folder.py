@@ -15,10 +15,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import shutil
-import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +28,7 @@ from scipy import sparse
 from torch import Tensor
 
 from data_schema.levels import Level
+from data_schema.replace import beside
 from surrogates.data.campaign import Labels
 from surrogates.data.graphs import Graphs
 from surrogates.data.inputs import InputScaling
@@ -59,8 +57,9 @@ def save(surrogate: Surrogate, folder: str | Path, *, overwrite: bool = False) -
     folder = Path(folder)
     refuse_other(folder, overwrite)
     try:
-        with _beside(folder) as part:
-            _write(surrogate, part)
+        with beside(folder, durable=True) as new:
+            new.mkdir()
+            _write(surrogate, new)
     except OSError as error:
         raise ModelFolderError(
             f"{folder}: cannot be written ({error.strerror or error}); check permissions and free space"
@@ -254,25 +253,6 @@ def _bands(tensors: Mapping[str, Tensor], record: Record) -> dict[tuple[int, boo
             parts = {n: tensors[f"{number}.{where}.{n}"].numpy() for n in ("node", "state", "factor")}
             out[int(number), where == "full"] = Band(**parts, time=record.time, runs=int(tensors[key][0]))
     return out
-
-
-@contextmanager
-def _beside(folder: Path) -> Iterator[Path]:
-    """A fresh folder that takes the place of `folder` at the end, or is thrown away."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    part = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    part.chmod(0o755)
-    try:
-        yield part
-        if folder.exists():
-            old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-            folder.replace(old)
-            part.replace(folder)
-            shutil.rmtree(old, ignore_errors=True)
-        else:
-            part.replace(folder)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
 
 
 def _plain(value: Any) -> Any:

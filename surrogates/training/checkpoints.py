@@ -13,6 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from data_schema.replace import beside
 from surrogates.data.campaign import Campaign
 from surrogates.errors import SurrogateError
 from surrogates.settings import Settings
@@ -67,9 +68,8 @@ class Checkpoints:
     def save(self, name: str, tensors: dict[str, Tensor], about: dict[str, Any]) -> None:
         """Write level `name`; the file before stays until the new one is complete."""
         path = self._path(name)
-        beside = path.with_suffix(".part")
-        save_file({k: v.contiguous().cpu() for k, v in tensors.items()}, beside, {"about": json.dumps(about)})
-        beside.replace(path)
+        with beside(path, durable=True) as new:
+            save_file({k: v.contiguous().cpu() for k, v in tensors.items()}, new, {"about": json.dumps(about)})
         self._last = time.monotonic()
 
     def discard(self) -> None:

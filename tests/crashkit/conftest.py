@@ -35,4 +35,4 @@ def demo_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def quick_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     """Files need not survive a power cut during a test."""
-    monkeypatch.setattr("crashkit.ingestion.store._synchronise", lambda path: None)
+    monkeypatch.setattr("data_schema.replace._synchronise", lambda path: None)

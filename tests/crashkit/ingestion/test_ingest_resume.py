@@ -21,9 +21,10 @@ from memory_runs import MemoryRun, RunsInMemory
 
 from crashkit.dataset import demo_data, open_dataset
 from crashkit.errors import DataError, OutputError, ReadError
-from crashkit.ingestion import assembly, store, transfer
+from crashkit.ingestion import assembly, transfer
 from crashkit.ingestion.ingest import ingest
 from crashkit.ingestion.staging import Staging
+from data_schema import replace as replacing
 from data_schema import validate
 
 OUTPUTS = (".zarr", ".nc")
@@ -103,7 +104,7 @@ def test_appending_leaves_a_whole_dataset_at_every_step(tmp_path: Path, suffix: 
     before = contents(output)
     ingest(other, expected, names="{source}-{run}")
     with pytest.MonkeyPatch.context() as patch:
-        kill_at(patch, store, step, after)
+        kill_at(patch, assembly if step == "put_in_place" else replacing, step, after)
         try:
             ingest(other, output, names="{source}-{run}")
         except Killed:
@@ -123,7 +124,7 @@ def test_where_folders_cannot_be_exchanged_the_old_one_comes_back(
     for target in (output, expected):
         ingest(one, target, names="{source}-{run}")
     ingest(other, expected, names="{source}-{run}")
-    monkeypatch.setattr(store, "_exchange", lambda one, other: False)
+    monkeypatch.setattr(replacing, "_exchange", lambda one, other: False)
     real = Path.replace
     count = 0
 
