@@ -1,8 +1,8 @@
 """What can be chosen: one model, checked once, stored with every surrogate.
 
-Settings come from four places, later ones winning: the defaults of a preset ("fast", or "paper" for exactly what the
-paper does), the model's own, a YAML file, and overrides such as `level.epochs=200`. Widths are derived from the data;
-nobody types the number of nodes or inputs.
+Settings come from four places; a later one replaces an earlier one: the preset ("fast", or "paper" for exactly what the
+paper does), the defaults of the model, a YAML file, and overrides such as `level.epochs=200`. Sizes that follow from the
+data (nodes, inputs) are not settings.
 """
 
 from __future__ import annotations
@@ -33,7 +33,15 @@ class _Frozen(BaseModel):
 
 
 class MlpSettings(_Frozen):
-    """The network from parameters and time to the latent vector; linear after the last hidden layer."""
+    """The network from parameters and time to the latent vector.
+
+    Attributes
+    ----------
+    widths
+        Widths of the hidden layers; the output layer is linear.
+    activation
+        Activation function of the hidden layers.
+    """
 
     widths: tuple[Positive, ...] = (64, 64, 64)
     activation: Literal["elu", "gelu", "silu", "tanh"] = "elu"
@@ -42,16 +50,39 @@ class MlpSettings(_Frozen):
 class LevelSettings(_Frozen):
     """One level: its reduction, its regression and how both are trained.
 
-    reduction      gcn: graph convolutions and a dense layer; ae: fully connected; pod: linear, computed, not trained; or
-                   the name of a registered one
-    convolution    of gcn: Chebyshev (cheb), first order (gcn) or with initial residual (gcn2)
-    channels       of gcn, behind the three coordinates
-    order          Chebyshev terms
-    hidden         of ae: widths between state and latent vector
-    regression     network: the MLP; process: a Gaussian process over whole runs, fitted to the encoded training states;
-                   mean of both; auto: what is best on validation runs. Levels trained together have the MLP alone
-    rate_inputs    0, or: layers that sum over more numbers than this learn slower, in proportion
-    start          pod: reduction gcn or ae beside a trainable linear part that starts at POD, its own end at zero
+    Attributes
+    ----------
+    reduction
+        `gcn`: graph convolutions and a dense layer; `ae`: fully connected autoencoder; `pod`: POD, computed and not
+        trained; or the name of a registered reduction.
+    convolution
+        Kind of convolution of `gcn`: Chebyshev (`cheb`), first order (`gcn`) or with initial residual (`gcn2`).
+    latent
+        Length of the latent vector.
+    channels
+        Channels of `gcn` after each convolution; the input has the three coordinates.
+    order
+        Number of Chebyshev terms.
+    hidden
+        Widths of the hidden layers of `ae`, from the state to the latent vector.
+    start
+        `plain`: random initial weights; `pod`: sum of a POD-initialised linear autoencoder, which is trained too, and
+        the reduction `gcn` or `ae`, whose output is initialised to zero.
+    mlp
+        The network from parameters and time to the latent vector.
+    regression
+        `network`: the MLP; `process`: a Gaussian process over whole runs, fitted to the encoded training states;
+        `mean` of both; `auto`: the best of the three on validation runs. Levels that are trained together use the MLP.
+    epochs, batch
+        Passes over the training states; states per step.
+    learning_rate, schedule, optimiser, weight_decay
+        Of the training; `one_cycle` and `cosine` change the rate during the training.
+    clip
+        Largest norm of a gradient; 0: no limit.
+    rate_inputs
+        The learning rate of a layer is scaled by min(1, rate_inputs / number of its inputs); 0: off.
+    weight_approximation, weight_reconstruction
+        Weights of the two parts of the loss (section 3.3).
     """
 
     reduction: str = "gcn"
@@ -92,12 +123,19 @@ class LevelSettings(_Frozen):
 
 
 class TransferSettings(_Frozen):
-    """What a level takes over from the frozen coarser one (section 3.4).
+    """How a level uses the frozen coarser one (section 3.4).
 
-    upsampling  static: the barycentric U; sparse: only U's non-zeros train; linear: all of W x + b (equation 12)
-    encoder     add: z = enc(D x) + enc*(x); concat: both side by side, so the latent vector grows
-    mlp         input: the coarse output is a further input; residual: it is also added to the result
-    epochs      share of its epochs that a level trains for which starts from a coarser one
+    Attributes
+    ----------
+    upsampling
+        `static`: the barycentric U; `sparse`: only the non-zero entries of U are trained; `linear`: all of W x + b
+        (equation 12).
+    encoder
+        `add`: z = enc(D x) + enc*(x); `concat`: both side by side, so the latent vector grows.
+    mlp
+        `input`: the output of the coarse regression is a further input; `residual`: it is also added to the result.
+    epochs
+        Fraction of `level.epochs` used by a level that starts from a coarser one.
     """
 
     upsampling: Literal["static", "sparse", "linear"] = "linear"
@@ -107,14 +145,20 @@ class TransferSettings(_Frozen):
 
 
 class InputSettings(_Frozen):
-    """What the regression sees beside the parameters and the time, each scaled to [-1, 1].
+    """Further inputs of the regression, beside parameters and time; all are scaled to [-1, 1].
 
-    derived        what stands in for the parameters: off (themselves); auto (chosen by cross-validation among logarithms,
-                   a warped angle, monomials that the units allow, and a full matrix of lengths); or monomials such as
-                   impact_speed**2/yield_stress, one or a list
-    products       each parameter times the time
-    angles         sine and cosine of parameters in degree
-    initial_state  the encoded first state of the run (z0)
+    Attributes
+    ----------
+    derived
+        What replaces the parameters: `off` (nothing); `auto` (chosen by cross-validation among logarithms, a warped
+        angle, monomials that the units allow, and a full matrix of lengths); or monomials such as
+        `impact_speed**2/yield_stress`, one or a list.
+    products
+        Also each parameter times the time.
+    angles
+        Also sine and cosine of parameters in degree.
+    initial_state
+        Also the encoded first state of the run (z0).
     """
 
     derived: Literal["auto", "off"] | tuple[str, ...] = "auto"
@@ -135,9 +179,16 @@ class InputSettings(_Frozen):
 class PhysicsSettings(_Frozen):
     """What is known of a crash before the first run: see `surrogates.physics`.
 
-    clock     runs are put on one clock and size; auto: exponents by cross-validation where a parameter is a speed
-    symmetry  mirrored runs train as well; auto: where the mesh has a plane, and cross-validation agrees
-    odd       parameters that change their sign in the mirror, such as [impact_angle]; without, cross-validation proposes
+    Attributes
+    ----------
+    clock
+        `auto`: scale time and displacement of the runs to a common clock and size, with exponents chosen by
+        cross-validation, if a parameter is a speed; `off`: do not.
+    symmetry
+        `auto`: also train on mirrored runs, if the mesh has a plane of symmetry and cross-validation shows a gain;
+        `off`: do not.
+    odd
+        Parameters that change their sign in the mirror, such as [impact_angle]; None: chosen by cross-validation.
     """
 
     clock: Literal["auto", "off"] = "auto"
@@ -156,11 +207,18 @@ class PhysicsSettings(_Frozen):
 
 
 class ValidationSettings(_Frozen):
-    """Which weights are kept: those of the epoch with the lowest total loss.
+    """How the best epoch and other choices are found; the weights of the epoch with the lowest total loss are kept.
 
-    measure  runs: on runs held out of the training runs; paper: on the training runs themselves
-    share    of the training runs held out, drawn by the seed; `runs` names them instead
-    folds    parts of the training runs that are left out in turn, where choices are made by cross-validation
+    Attributes
+    ----------
+    measure
+        `runs`: loss on validation runs held out of the training runs; `paper`: loss on the training runs themselves.
+    share
+        Fraction of the training runs held out, drawn with the seed.
+    runs
+        Names of the validation runs, instead of `share`.
+    folds
+        Number of folds of a cross-validation over training runs.
     """
 
     measure: Literal["runs", "paper"] = "runs"
@@ -170,10 +228,16 @@ class ValidationSettings(_Frozen):
 
 
 class RefinementSettings(_Frozen):
-    """Adaptive refinement: finer levels only where the coarser one is wrong (section 3.5).
+    """Adaptive refinement: finer levels only where the coarser one has large errors (section 3.5).
 
-    share  of the coarse nodes with the largest validation error that count as faulty
-    rings  how many rings of neighbours in the finer graph are added around each
+    Attributes
+    ----------
+    adaptive
+        Whether finer levels are refined adaptively.
+    share
+        Fraction of the coarse nodes, those with the largest validation error, around which nodes are added.
+    rings
+        How many rings of neighbours in the finer graph are added around each of them.
     """
 
     adaptive: bool = False
@@ -184,10 +248,15 @@ class RefinementSettings(_Frozen):
 class PodSettings(_Frozen):
     """POD with Gaussian processes or radial basis functions.
 
-    modes   numbers of modes to choose from by cross-validation
-    inputs  trajectory: a whole run is one sample; point: parameters and time are the inputs; auto: cross-validation
-            decides
-    points  most samples of "point" that a Gaussian process is given
+    Attributes
+    ----------
+    modes
+        Numbers of modes to choose from by cross-validation.
+    inputs
+        `trajectory`: one sample per run; `point`: one sample per state, with the time as an input; `auto`: chosen by
+        cross-validation.
+    points
+        Largest number of samples for a Gaussian process with `point`.
     """
 
     modes: tuple[Positive, ...] = (2, 4, 8, 16, 32, 48, 64, 96)
@@ -196,15 +265,31 @@ class PodSettings(_Frozen):
 
 
 class Settings(_Frozen):
-    """Everything that decides what a surrogate becomes, besides the data.
+    """All settings of a training.
 
-    levels     mesh levels the cascade climbs, coarsest first; empty: all that the hierarchy has
-    level      settings of every level
-    at         settings of single levels by their number, over those of `level`
-    unified    one latent vector for all levels, trained together (section 3.5)
-    precision  tf32 and bfloat16 (dense layers only) speed up a GPU
-    missing    displacements of nodes that are gone: auto (hold each node's last one where elements erode, refuse elsewhere),
-               hold or refuse
+    Attributes
+    ----------
+    model
+        Kind of model: `mh`, `podnn`, `aenn`, `gaenn`, `pod-gpr` or `pod-rbf`.
+    preset
+        `fast`, or `paper` for exactly what the paper does.
+    seed
+        Of all random numbers.
+    levels
+        Mesh levels of the cascade, coarsest first; empty: all levels of the hierarchy.
+    level
+        Settings of every level.
+    at
+        Settings of single levels, by level number; they replace those of `level`.
+    transfer, inputs, physics, validation, refinement, pod
+        See the classes above.
+    unified
+        One latent vector for all levels, trained together (section 3.5).
+    precision
+        `tf32` and `bfloat16` (dense layers only) are faster on a GPU.
+    missing
+        Nodes without a displacement: `hold` the last displacement of each; `refuse` such runs; `auto`: hold if
+        elements erode, else refuse.
     """
 
     model: Model = "mh"
