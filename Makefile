@@ -6,13 +6,17 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 DEMO   ?= demo
 
-.PHONY: demo test check docs clean
+.PHONY: demo test nightly check docs clean
 
 demo: $(READY)
 	$(BIN)/crashkit demo -o $(DEMO)
 
 test: $(READY) check docs
 	$(BIN)/python -m pytest -n 2
+
+# What takes more than 40 s a test.
+nightly: $(READY)
+	$(BIN)/python -m pytest -m nightly --timeout 3600
 
 check: $(READY)
 	$(BIN)/ruff check .

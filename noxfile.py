@@ -42,6 +42,13 @@ def tests(session: nox.Session) -> None:
     session.run("pytest", *(session.posargs or ["-n", "2"]))
 
 
+@nox.session(default=False)
+def nightly(session: nox.Session) -> None:
+    """The tests that take more than 40 s."""
+    install(session, "test", "docs")
+    session.run("pytest", "-m", "nightly", "--timeout", "3600", *session.posargs)
+
+
 @nox.session
 def docs(session: nox.Session) -> None:
     """The site in `site/`; dead links are errors."""

@@ -7,8 +7,11 @@ New examples are sought with `pytest --hypothesis-profile=explore`; what it find
 
 from __future__ import annotations
 
+import os
 import signal
+import tempfile
 
+import pytest
 from hypothesis import settings
 
 # A shell starts what runs in the background deaf to Ctrl-C, and children inherit that; tests that interrupt need ears.
@@ -18,3 +21,19 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 settings.register_profile("repeatable", derandomize=True, deadline=None)
 settings.register_profile("explore", max_examples=500, deadline=None)
 settings.load_profile("repeatable")
+
+_TEMPORARY = pytest.StashKey[tempfile.TemporaryDirectory]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """What tests, their libraries and child processes put into the temporary folder goes with the session.
+
+    pytest's own folders (`tmp_path`) stay where they are, so that those of a failed test can be looked at.
+    """
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", tempfile.gettempdir())
+    config.stash[_TEMPORARY] = tempfile.TemporaryDirectory(prefix="crashkit-tests-", ignore_cleanup_errors=True)
+    os.environ["TMPDIR"] = tempfile.tempdir = config.stash[_TEMPORARY].name
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    config.stash[_TEMPORARY].cleanup()

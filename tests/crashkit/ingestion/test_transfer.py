@@ -118,6 +118,11 @@ def test_erosion_of_solids_is_written_where_there_are_solids(desk: Desk) -> None
     assert staged.digests.keys() == {"displacement", "alive", "cell_alive"}
 
 
+def test_nothing_is_written_of_erosion_where_nothing_dies(desk: Desk) -> None:
+    desk.send(MemoryRun(mesh=block(), alive_cells=np.ones((5, 4), bool)))
+    assert desk.names() == {"displacement"}
+
+
 def test_at_other_times_values_flags_and_fields_are_those_between_with_the_error_told(desk: Desk) -> None:
     alive = np.ones((5, 8), bool)
     alive[3:, 6] = False

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from surrogates.data.campaign import Campaign
-from surrogates.data.samples import Notes, Runs, check, scale_of, split
+from surrogates.data.samples import Notes, Runs, check, everything, scale_of, split
 from surrogates.errors import SurrogateError
 from surrogates.settings import settings
 
@@ -271,3 +271,17 @@ def test_the_scale_of_a_level_is_its_rms() -> None:
 def test_nothing_can_be_learnt_where_nothing_moves(mean_square: float) -> None:
     with pytest.raises(SurrogateError, match="no training run moves"):
         scale_of(mean_square)
+
+
+def test_displacements_kept_in_double_precision_are_read_in_single() -> None:
+    u = plate.displacement(plate.parameters(6)).astype(np.float64)
+    found = Runs(plate.campaign(6, displacement=lambda level: u), 0, settings("mh"), Notes()).read(2)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, u[2])
+
+
+def test_models_that_choose_by_folds_train_on_all_runs_whatever_is_named_for_the_choice() -> None:
+    chosen = everything(plate.campaign(6), settings("pod-gpr"))
+    assert (chosen.training.tolist(), chosen.validation.tolist()) == (list(range(6)), [])
+    named = everything(plate.campaign(6), settings("pod-gpr", overrides=["validation.runs=[run_004, run_001]"]))
+    assert (named.training.tolist(), named.validation.tolist()) == (list(range(6)), [1, 4])
