@@ -52,6 +52,7 @@ class Record:
     errors      e2 (m) by what was measured, on validation runs, on the level's own nodes
     choice      what a POD regression chose by cross-validation: inputs and modes
     physics     inputs, clock and symmetry in words, and "errors": e2 (m) by what each was worth in cross-validation
+    parameters  parameter -> its values in the runs it was fitted to, for marks on sliders
     left_out    run -> e2 (m) when it is left out of the training, and the deviation the process then believes in, up to
                 a factor; of processes alone
     notes       what was unusual about the data
@@ -71,6 +72,7 @@ class Record:
     errors: dict[str, float] = field(default_factory=dict)
     choice: dict[str, Any] = field(default_factory=dict)
     physics: dict[str, Any] = field(default_factory=dict)
+    parameters: dict[str, list[float]] = field(default_factory=dict)
     left_out: dict[str, tuple[float, float]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
@@ -88,6 +90,9 @@ class Record:
             created=datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
             versions=_versions(),
             attributes=dict(campaign.attributes or {}),
+            parameters={
+                n: campaign.parameters[split.training, k].tolist() for k, n in enumerate(campaign.parameter_names)
+            },
         )
 
 
@@ -132,6 +137,7 @@ def record_from_dict(values: Mapping[str, Any], histories: Mapping[int, dict[str
         errors=dict(values["errors"]),
         choice=dict(values["choice"]),
         physics=dict(values["physics"]),
+        parameters={str(k): [float(x) for x in v] for k, v in values.get("parameters", {}).items()},
         left_out={str(k): (float(e), float(d)) for k, (e, d) in values.get("left_out", {}).items()},
         notes=list(values["notes"]),
     )  # fmt: skip

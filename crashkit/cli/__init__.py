@@ -26,6 +26,7 @@ COMMANDS = (
     "train",
     "evaluate",
     "predict",
+    "explore",
     "propose",
     "campaign",
     "export",

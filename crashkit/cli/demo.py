@@ -69,6 +69,11 @@ def steps(output: Path, source: Path) -> list[Step]:
             ),
             output / "new_crash.pvd",
         ),
+        Step(
+            "Both models as one page with sliders, for any browser or phone",
+            command("explore", models["mh"], models["pod-gpr"], "-o", output / "crash.html", "--title", "Kart frame"),
+            output / "crash.html",
+        ),
     ]  # fmt: skip
 
 
@@ -144,6 +149,7 @@ def show_result(output: Path) -> None:
     )
     say("Open next:")
     for path, what in (
+        (output / "crash.html", "sliders: change speed, angle and strength and see the crash, in a browser"),
         (output / "report" / "report.html", "the report, in a browser"),
         (output / "report" / "vtk", "truth, prediction and error of two runs, in ParaView (.pvd or .vtkhdf)"),
         (output / "new_crash.pvd", "a crash nobody computed, in ParaView"),

@@ -1,0 +1,1 @@
+"""The page with sliders: what a model needs in a browser, and the page around it."""

@@ -1,0 +1,125 @@
+"""A surrogate as plain values and arrays from which a web page can compute its predictions.
+
+Nothing is executed on the way: a process is its kernel's numbers and what stands by them, a network is a list of steps on
+named vectors (`linear`, `activation`, `chebyshev`, ...). `evaluation/explorer/model.js` reads both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogates.errors import SurrogateError
+from surrogates.models.cascade import Cascade
+from surrogates.models.pod_regression import PodRegression
+from surrogates.regression.gaussian import Gaussian
+from surrogates.storage.steps import cascade_steps, side_by_side
+from surrogates.surrogate import Surrogate
+
+
+@dataclass(frozen=True)
+class Browsable:
+    """What the page needs of one model.
+
+    Attributes
+    ----------
+    about
+        Plain values; names in it mean arrays.
+    arrays
+        Numbers by name.
+    quantised
+        Names of arrays (row, column) that may be rounded to 1/32767 of each column's largest value.
+    """
+
+    about: dict[str, Any]
+    arrays: dict[str, NDArray[Any]]
+    quantised: frozenset[str] = field(default_factory=frozenset)
+
+
+def browsable(surrogate: Surrogate, name: str, prefix: str, share: float = 0.9) -> Browsable:
+    """The model `surrogate`, called `name`, with arrays whose names begin with `prefix`.
+
+    Raises
+    ------
+    SurrogateError
+        For a kind of model that has no form for a browser; says which have.
+    """
+    core = surrogate.core
+    arrays: dict[str, NDArray[Any]] = {}
+    quantised: set[str] = set()
+    about: dict[str, Any] = {
+        "name": name, "time": surrogate.record.time.tolist(), "registration": _registration(surrogate),
+        "levels": _levels(surrogate, arrays, prefix), "bands": _bands(surrogate, arrays, prefix, share), "folds": [],
+    }  # fmt: skip
+    if isinstance(core, PodRegression):
+        about |= _process(core, arrays, quantised, prefix)
+    elif isinstance(core, Cascade):
+        about |= cascade_steps(core, about["levels"], arrays, prefix)
+    else:
+        raise SurrogateError(
+            f"{name}: unified levels have no form for a browser; use mh, podnn, aenn, gaenn or pod-gpr"
+        )
+    return Browsable(about, arrays, frozenset(quantised))
+
+
+def _process(core: PodRegression, arrays: dict[str, NDArray[Any]], quantised: set[str], prefix: str) -> dict[str, Any]:
+    if not isinstance(core.machine, Gaussian) or core.inputs != "trajectory":
+        raise SurrogateError("only Gaussian processes over whole runs have a form for a browser; train pod-gpr or mh")
+    known = core.data.values.reshape(len(core.data.values), -1).astype(np.float64)
+    mean, pull = core.machine.expanded(known)
+    named = {
+        "x": core.machine.x, "mix": core.machine.kernel.mix, "mean": mean, "pull": pull, "modes": core.modes,
+        "grid": core.data.time, "low": core.low, "high": core.high,
+    }  # fmt: skip
+    for key, values in named.items():
+        arrays[prefix + key] = np.asarray(values, np.float32 if key == "modes" else np.float64)
+    quantised.add(f"{prefix}modes")
+    kernel = core.machine.kernel
+    return {
+        "kind": "process", "arrays": {key: prefix + key for key in named},
+        "kernel": {"variance": float(kernel.variance), "slope": float(kernel.slope)},
+        "modes": core.modes.shape[1], "samples": len(core.machine.x), "kept": (core.high > core.low).tolist(),
+    }  # fmt: skip
+
+
+def _registration(surrogate: Surrogate) -> dict[str, Any]:
+    told: Mapping[str, Any] = surrogate.registration.as_dict()
+    clock = told["clock"]
+    return {
+        "columns": told["inputs"]["columns"], "flagged": told["symmetry"]["flagged"], "speed": clock["speed"],
+        "exponents": clock["exponents"], "reference": clock["reference"], "start": clock["start"],
+    }  # fmt: skip
+
+
+def _levels(surrogate: Surrogate, arrays: dict[str, NDArray[Any]], prefix: str) -> list[dict[str, Any]]:
+    """The model's levels, the finest first, and the maps from coarse ones to the full mesh."""
+    out: list[dict[str, Any]] = []
+    for name, number in sorted(surrogate.level_names.items(), key=lambda item: item[1]):
+        level: dict[str, Any] = {"number": number, "name": name, "nodes": surrogate.graphs.n_nodes(number)}
+        if number:
+            columns, weights = side_by_side(surrogate.graphs.to_full(number))
+            level["lift"] = {"columns": f"{prefix}lift_{number}_columns", "weights": f"{prefix}lift_{number}_weights"}
+            arrays[level["lift"]["columns"]], arrays[level["lift"]["weights"]] = columns, weights
+        out.append(level)
+    return out
+
+
+def _bands(surrogate: Surrogate, arrays: dict[str, NDArray[Any]], prefix: str, share: float) -> dict[str, Any]:
+    """Of each level, the band on the full mesh: a half-width per node and state of the trained times."""
+    out: dict[str, Any] = {}
+    for number in surrogate.level_names.values():
+        if not surrogate.has_band(number):
+            continue
+        width = surrogate.band(share, surrogate.record.time, number, full=True)
+        largest = width.max(axis=0)
+        place = int(largest.argmax())
+        names = {key: f"{prefix}band_{number}_{key}" for key in ("node", "state", "time")}
+        arrays[names["node"]] = largest.astype(np.float32)
+        arrays[names["state"]] = (width[:, place] / max(float(largest[place]), 1e-12)).astype(np.float64)
+        arrays[names["time"]] = surrogate.record.time.astype(np.float64)
+        out[str(number)] = {**names, "factor": 1.0}
+    return out

@@ -1,0 +1,186 @@
+"""The page with sliders in a real browser: its predictions are Python's."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import plate
+import pytest
+
+from crashkit.api.explore import explore
+from crashkit.errors import DataError, OutputError
+from evaluation.errors import EvaluationError
+from evaluation.explorer.page import BrowserModel, ExplorerMesh, explorer_page, packed, quantised, triangles
+from surrogates.errors import SurrogateError
+from surrogates.settings import settings
+from surrogates.storage.browser import browsable
+from surrogates.storage.folder import save
+from surrogates.surrogate import Surrogate
+from surrogates.training.train import train
+
+BROWSER = next((b for b in ("chromium", "chromium-browser", "google-chrome") if shutil.which(b)), None)
+FLAGS = (
+    "--headless", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+    "--virtual-time-budget=60000", "--dump-dom",
+)  # fmt: skip
+MODELS = {
+    "mh": ["level.epochs=2", "transfer.epochs=1"],
+    "gcn": ["level.epochs=2", "level.start=plain", "transfer.upsampling=linear", "inputs.products=true"],
+    "pod-gpr": [],
+}
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Surrogate]]:
+    """Small models of a plate, as folders and loaded."""
+    home, out = tmp_path_factory.mktemp("models"), {}
+    for name, told in MODELS.items():
+        surrogate = train(plate.campaign(10), settings("mh" if name == "gcn" else name, overrides=told))
+        save(surrogate, home / name)
+        out[name] = (home / name, surrogate)
+    return out
+
+
+def in_browser(page: Path, script: str) -> object:
+    """What the JavaScript expression `script` gives in the page once it is ready."""
+    ask = (
+        '<script>(async()=>{while(document.documentElement.dataset.ready!=="yes")await new Promise(r=>setTimeout(r,20));'
+        f"return await (async()=>{{{script}}})();}})().catch(e=>({{error:e.message}})).then(v=>{{"
+        'const d=document.createElement("pre");d.id="answer";d.textContent=JSON.stringify(v);document.body.append(d);});</script>'
+    )
+    asking = page.with_name("asking.html")
+    asking.write_text(page.read_text(encoding="utf-8").replace("</body>", ask + "</body>"), encoding="utf-8")
+    done = subprocess.run(
+        [str(BROWSER), *FLAGS, asking.as_uri()], capture_output=True, text=True, timeout=240, check=False
+    )
+    found = re.search(r'id="answer">(.*?)</pre>', done.stdout, re.DOTALL)
+    assert found is not None, done.stdout[-2000:] + done.stderr[-2000:]
+    return json.loads(found[1].replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&"))
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium or Chrome is installed")
+def test_twenty_predictions_of_every_model_and_level_are_those_of_python(
+    models: dict[str, tuple[Path, Surrogate]], tmp_path: Path
+) -> None:
+    page = explore([folder for folder, _ in models.values()], tmp_path / "crash.html")
+    rng = np.random.default_rng(0)
+    asked, truth = [], []
+    for name, (_, surrogate) in models.items():
+        ranges = surrogate.record.ranges
+        for _ in range(20):
+            values = ranges.low + (ranges.high - ranges.low) * rng.uniform(size=len(ranges.names))
+            time = float(rng.uniform(*ranges.time))
+            for level in sorted({0, *surrogate.level_names.values()}):
+                asked.append([name, dict(zip(ranges.names, values.tolist(), strict=True)), time, level])
+                finest = min(surrogate.level_names.values())
+                ask = surrogate.predict_full if level == 0 else surrogate.predict
+                truth.append(ask(values, np.array([time]), finest if level == 0 else level)[0].ravel())
+    found = in_browser(
+        page,
+        f"const out=[];for(const [n,p,t,l] of {json.dumps(asked)})out.push(Array.from(await crashkit.predict(p,t,l,n)));return out;",
+    )
+    assert isinstance(found, list)
+    largest = max(np.abs(u).max() for u in truth)
+    for given, expected in zip(found, truth, strict=True):
+        np.testing.assert_allclose(given, expected, atol=1e-4 * largest)
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium or Chrome is installed")
+def test_sliders_levels_and_holding_work_and_what_is_outside_is_said(
+    models: dict[str, tuple[Path, Surrogate]], tmp_path: Path
+) -> None:
+    page = explore([models["mh"][0], models["pod-gpr"][0]], tmp_path / "crash.html", title="Plate <1>")
+    said = in_browser(
+        page,
+        """
+        const get = (id) => document.getElementById(id);
+        const until = async (f) => { for (let k = 0; k < 200 && !f(); k++) await new Promise((r) => setTimeout(r, 20)); };
+        const slider = document.querySelector('#sliders input');
+        const before = get('numbers').textContent;
+        get('hold').click();
+        slider.value = slider.max; slider.dispatchEvent(new Event('input')); await until(() => get('warnings').textContent);
+        const outside = get('warnings').textContent, both = get('numbers').textContent;
+        get('level').value = '2'; get('level').dispatchEvent(new Event('change'));
+        get('time').value = '0'; get('time').dispatchEvent(new Event('input'));
+        await until(() => get('now').textContent === '0.0 ms');
+        const sliders = document.querySelectorAll('#sliders input').length;
+        return {before, outside, both, sliders, title: document.title, now: get('now').textContent};
+        """,
+    )
+    assert isinstance(said, dict)
+    assert said["title"] == "Plate <1>"
+    assert said["sliders"] == 3
+    assert "outside the trained range" in said["outside"]
+    assert "the held one" in said["both"]
+    assert said["before"] != said["both"]
+    assert said["now"] == "0.0 ms"
+
+
+def test_an_unknown_parameter_or_level_is_an_error_in_the_page(
+    models: dict[str, tuple[Path, Surrogate]], tmp_path: Path
+) -> None:
+    if BROWSER is None:
+        pytest.skip("no Chromium or Chrome is installed")
+    page = explore(models["mh"][0], tmp_path / "crash.html")
+    said = in_browser(page, "return await crashkit.predict({impact_speed: 20}, 0.01, 0);")
+    assert said == {"error": "parameter impact_angle: expected a number, found undefined"}
+
+
+def test_a_page_is_never_replaced_unasked(models: dict[str, tuple[Path, Surrogate]], tmp_path: Path) -> None:
+    page = explore(models["mh"][0], tmp_path / "crash.html")
+    text = page.read_text()
+    with pytest.raises(OutputError, match="is there already"):
+        explore(models["pod-gpr"][0], page)
+    assert page.read_text() == text
+    explore(models["pod-gpr"][0], page, overwrite=True)
+    assert page.read_text() != text
+    with pytest.raises(OutputError, match=r"ends in \.html"):
+        explore(models["mh"][0], tmp_path / "crash.png")
+
+
+def test_nothing_is_fetched_from_anywhere(models: dict[str, tuple[Path, Surrogate]], tmp_path: Path) -> None:
+    text = explore(models["mh"][0], tmp_path / "crash.html").read_text()
+    assert not re.search(r"(src|href)\s*=\s*[\"']?(https?:)?//", text)
+    assert "import(" not in text
+
+
+def test_models_of_different_meshes_do_not_share_a_page(
+    models: dict[str, tuple[Path, Surrogate]], tmp_path: Path
+) -> None:
+    other = train(plate.campaign(10), settings("pod-gpr"))
+    assert other.points is not None
+    other.points = other.points[:-1]
+    save(other, tmp_path / "other")
+    with pytest.raises(DataError, match="another mesh"):
+        explore([models["mh"][0], tmp_path / "other"], tmp_path / "crash.html")
+
+
+def test_what_has_no_form_for_a_browser_is_refused() -> None:
+    surrogate = train(plate.campaign(10), settings("pod-rbf"))
+    with pytest.raises(SurrogateError, match="have a form for a browser"):
+        browsable(surrogate, "rbf", "m0_")
+
+
+def test_models_with_other_parameters_do_not_share_a_page() -> None:
+    mesh = ExplorerMesh(np.zeros((3, 3)), np.array([[0, 1, 2]], np.int32))
+    two = [BrowserModel({"parameters": [{"name": n}]}, {}) for n in ("a", "b")]
+    with pytest.raises(EvaluationError, match="different parameters"):
+        explorer_page("x", two, mesh)
+
+
+def test_rounded_columns_are_off_by_at_most_half_a_step() -> None:
+    values = np.random.default_rng(0).normal(size=(50, 3)) * [1e-6, 1.0, 1e6]
+    whole, steps = quantised(values)
+    back = whole.reshape(50, 3) * np.array(steps)
+    assert (np.abs(back - values) <= 0.5000001 * np.array(steps)).all()
+    assert packed(whole, steps)["kind"] == "i2"
+
+
+def test_quadrilaterals_become_two_triangles() -> None:
+    faces = np.array([[0, 1, 2, 3], [4, 5, 6, -1]], np.int32)
+    assert triangles(faces).tolist() == [[0, 1, 2], [4, 5, 6], [0, 2, 3]]
