@@ -2,7 +2,8 @@
 
 Read `layout.py` to know every dimension, variable, unit and attribute; `validation.py` holds the rules a
 dataset must pass; `checksum.py` how its content is identified; `units.py` the unit systems crash solvers are run in;
-`levels.py` and `edges.py` the arrays of a coarse mesh, which all packages share. Nothing here reads or writes files.
+`levels.py`, `edges.py`, `pod.py` and `replace.py` what all packages share: the arrays of a coarse mesh, the streamed POD, and
+the way results appear under their names. Nothing here reads or writes a dataset.
 """
 
 from data_schema.checksum import dataset_checksum, digests_of_run, run_checksum

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from data_schema.pod import Pod, StreamedPod
 from evaluation.comparison.predictor import Model, Predictor
 from evaluation.comparison.reference import Reference
 from evaluation.comparison.scoring import Key, RunScores, Scores, full_field, gather, mesh_of, score_run
@@ -19,7 +20,7 @@ from evaluation.comparison.split import Entry, Split, entries
 from evaluation.comparison.timing import Timing, time_predictions
 from evaluation.errors import EvaluationError
 from evaluation.measures.distance import masked_mean
-from evaluation.measures.pod import Pod, StreamedPod
+from evaluation.measures.projection import held, moving
 from evaluation.measures.regions import by_grid, by_part
 from evaluation.measures.tally import Groups
 
@@ -139,15 +140,20 @@ def decompose(
     count: int = N_MODES,
     done: Callable[[int], None] | None = None,
 ) -> dict[int, Pod]:
-    """POD of `runs` on the full mesh and on every coarse level, reading each run once: level -> Pod."""
+    """POD of `runs` on the full mesh and on every coarse level, reading each run once: level -> Pod.
+
+    Raises EvaluationError where nothing moves.
+    """
+    if not runs:
+        raise EvaluationError("there is no training run to decompose; expected at least one")
     streams = {level: StreamedPod(count) for level in range(len(reference.levels) + 1)}
     for run in runs:
         truth = reference.displacement(run)
         for level, stream in streams.items():
-            stream.add(truth if level == 0 else truth[:, reference.level(level).kept])
+            stream.add(held(truth if level == 0 else truth[:, reference.level(level).kept]))
         if done:
             done(run)
-    return {level: stream.result() for level, stream in streams.items()}
+    return {level: moving(stream.result()) for level, stream in streams.items()}
 
 
 def default_groups(reference: Reference) -> tuple[Groups, dict[str, tuple[str, ...]]]:

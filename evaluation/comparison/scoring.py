@@ -19,7 +19,7 @@ from evaluation.comparison.reference import Reference
 from evaluation.comparison.sensors import Parted, Sensors, Watched, joined, part_error, watch
 from evaluation.errors import EvaluationError
 from evaluation.measures.distance import Peak, lift, masked_mean, mean_node_error, node_distance
-from evaluation.measures.pod import held, projection_error
+from evaluation.measures.projection import held, projection_error
 from evaluation.measures.tally import Groups, Tally, state_blocks
 
 Key = tuple[int, int]  # number of the model, number of its predictor

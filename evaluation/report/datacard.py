@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.output import complete_folder
+from data_schema.pod import Pod, StreamedPod
 from evaluation.comparison.reference import Reference, reference_of
 from evaluation.drawing.style import CM, MS, Sheet, readable
 from evaluation.errors import EvaluationError
@@ -25,7 +26,7 @@ from evaluation.figures.kind import Drawing, Kind, to_csv
 from evaluation.figures.outliers import Outliers, robust_score
 from evaluation.figures.singular_values import SingularValues
 from evaluation.measures.distance import gone, largest_node_error, mean_node_error, node_distance
-from evaluation.measures.pod import Pod, StreamedPod
+from evaluation.measures.projection import held, moving
 from evaluation.report.page import Page, plain_json, render_page, show_figure, show_table
 from evaluation.report.verdict import Statement
 
@@ -76,11 +77,11 @@ def summarise(reference: Reference, count: int = N_MODES, done: Callable[[int], 
         speeds.append(_fastest(u, reference.time))
         lost.append(float(gone(u[-1:]).mean()))
         samples.append(u[:, nodes])
-        stream.add(u)
+        stream.add(held(u))
         if done:
             done(run)
     return Summary(
-        np.array(means), np.array(largest), np.array(speeds), np.array(lost), np.array(samples), stream.result()
+        np.array(means), np.array(largest), np.array(speeds), np.array(lost), np.array(samples), moving(stream.result())
     )
 
 

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 import crashkit
 from crashkit.mesh.store import level_displacement
 from data_schema import parameters
+from data_schema.pod import pod
 from evaluation.measures.rigid import RigidMotion, fit_rigid
-from surrogates.reductions.pod import pod
 from surrogates.regression.gaussian import Gaussian
 
 LEVEL, MODES, FOLDS = 2, 48, 4

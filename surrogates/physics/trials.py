@@ -13,13 +13,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from data_schema.pod import pod
 from surrogates.data.campaign import Campaign, Mirror
 from surrogates.data.inputs import over_range
 from surrogates.data.samples import Notes, Runs
 from surrogates.errors import SurrogateError
 from surrogates.physics.registration import Registration
 from surrogates.physics.symmetry import mirrored
-from surrogates.reductions.pod import pod
 from surrogates.regression.gaussian import Gaussian, Kernel, RadialBasis
 from surrogates.settings import Settings
 

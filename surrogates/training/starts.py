@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from data_schema.pod import pod
 from surrogates.models.level import LevelNetwork
 from surrogates.models.unified import Unified
-from surrogates.reductions.pod import pod
 from surrogates.reductions.reduction import LinearReduction, LinearStart, flat
 
 # Gives the training states, some (node, b, 3) at a time, as often as it is called.

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import plate
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from surrogates.reductions.pod import pod
+from data_schema.pod import StreamedPod, pod
 
 
 def runs(count: int = 6, seed: int = 0) -> np.ndarray:
@@ -61,3 +61,51 @@ def test_cutting_off_between_runs_costs_little() -> None:
 def test_no_runs_are_an_error() -> None:
     with pytest.raises(ValueError, match="no runs"):
         pod(iter(()), 3)
+
+
+def _runs(seed: int, count: int, states: int = 4, nodes: int = 7) -> list[np.ndarray]:
+    return [r.astype(np.float32) for r in np.random.default_rng(seed).normal(size=(count, states, nodes, 3))]
+
+
+def _stacked(runs: list[np.ndarray]) -> np.ndarray:
+    return np.concatenate([r.reshape(len(r), -1) for r in runs]).astype(np.float64)
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 10**6), st.integers(1, 5))
+def test_streaming_gives_what_all_at_once_gives(seed, count):
+    runs = _runs(seed, count)
+    stream = StreamedPod(count=21)
+    for run in runs:
+        stream.add(run)
+    found = stream.result()
+    _, values, vt = np.linalg.svd(_stacked(runs), full_matrices=False)
+    np.testing.assert_allclose(found.singular_values, values[: len(found.singular_values)], rtol=1e-4)
+    # Modes are only fixed up to their sign (and rotation where values are close): compare what they span.
+    span = found.modes.astype(np.float64)
+    np.testing.assert_allclose(span @ span.T, vt.T @ vt, atol=2e-4)
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 10**6), st.integers(2, 6))
+def test_what_truncation_takes_away_is_bounded_by_the_defect(seed, keep):
+    runs = _runs(seed, 6)
+    stream = StreamedPod(count=2, keep=keep)
+    for run in runs:
+        stream.add(run)
+    found = stream.result()
+    exact = np.linalg.svd(_stacked(runs), compute_uv=False)[:2] ** 2
+    assert (found.singular_values**2 <= exact * (1 + 1e-5)).all()
+    assert (exact <= (found.singular_values**2 + found.defect) * (1 + 1e-5)).all()
+
+
+def test_runs_on_different_meshes_are_an_error():
+    stream = StreamedPod(2)
+    stream.add(np.ones((2, 3, 3)))
+    with pytest.raises(ValueError, match="run of 4 nodes follows runs of 3"):
+        stream.add(np.ones((2, 4, 3)))
+
+
+def test_no_mode_is_an_error() -> None:
+    with pytest.raises(ValueError, match="0 modes"):
+        StreamedPod(0)

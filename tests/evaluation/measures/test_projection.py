@@ -1,14 +1,13 @@
-"""The streamed decomposition against numpy's SVD of everything at once."""
+"""Projection on modes: its error, and what stands for nodes that are gone."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
+from data_schema.pod import StreamedPod, pod
 from evaluation.errors import EvaluationError
-from evaluation.measures.pod import StreamedPod, held, projection_error
+from evaluation.measures.projection import held, moving, projection_error
 
 
 def _runs(seed: int, count: int, states: int = 4, nodes: int = 7) -> list[np.ndarray]:
@@ -17,34 +16,6 @@ def _runs(seed: int, count: int, states: int = 4, nodes: int = 7) -> list[np.nda
 
 def _stacked(runs: list[np.ndarray]) -> np.ndarray:
     return np.concatenate([r.reshape(len(r), -1) for r in runs]).astype(np.float64)
-
-
-@settings(max_examples=20)
-@given(st.integers(0, 10**6), st.integers(1, 5))
-def test_streaming_gives_what_all_at_once_gives(seed, count):
-    runs = _runs(seed, count)
-    stream = StreamedPod(count=21)
-    for run in runs:
-        stream.add(run)
-    pod = stream.result()
-    _, values, vt = np.linalg.svd(_stacked(runs), full_matrices=False)
-    np.testing.assert_allclose(pod.singular_values, values[: len(pod.singular_values)], rtol=1e-4)
-    # Modes are only fixed up to their sign (and rotation where values are close): compare what they span.
-    span = pod.modes.astype(np.float64)
-    np.testing.assert_allclose(span @ span.T, vt.T @ vt, atol=2e-4)
-
-
-@settings(max_examples=20)
-@given(st.integers(0, 10**6), st.integers(2, 6))
-def test_what_truncation_takes_away_is_bounded_by_the_defect(seed, keep):
-    runs = _runs(seed, 6)
-    stream = StreamedPod(count=2, keep=keep)
-    for run in runs:
-        stream.add(run)
-    pod = stream.result()
-    exact = np.linalg.svd(_stacked(runs), compute_uv=False)[:2] ** 2
-    assert (pod.singular_values**2 <= exact * (1 + 1e-5)).all()
-    assert (exact <= (pod.singular_values**2 + pod.defect) * (1 + 1e-5)).all()
 
 
 def test_real_crashes_lose_nothing_worth_naming(reference):
@@ -97,24 +68,12 @@ def test_gone_nodes_take_no_part_in_the_projection_error(eroded, reference):
     np.testing.assert_allclose(masked[0, 2:], whole[0, 2:], rtol=1e-5)
 
 
-def test_runs_on_different_meshes_are_an_error():
-    stream = StreamedPod(2)
-    stream.add(np.ones((2, 3, 3)))
-    with pytest.raises(EvaluationError, match="run of 4 nodes follows runs of 3"):
-        stream.add(np.ones((2, 4, 3)))
-
-
 def test_modes_of_another_mesh_are_an_error():
     with pytest.raises(EvaluationError, match="modes have 2 nodes and the run 3"):
         projection_error(np.ones((1, 3, 3)), np.ones((6, 1)))
 
 
-def test_nothing_to_decompose_is_an_error():
-    with pytest.raises(EvaluationError, match="no run"):
-        StreamedPod(2).result()
-    still = StreamedPod(2)
-    still.add(np.zeros((2, 3, 3)))
+def test_states_in_which_nothing_moves_are_an_error():
+    still = pod([np.zeros((2, 3, 3))], 2)
     with pytest.raises(EvaluationError, match="nothing moves"):
-        still.result()
-    with pytest.raises(EvaluationError, match="0 modes"):
-        StreamedPod(0)
+        moving(still)
