@@ -23,6 +23,7 @@ settings.register_profile("explore", max_examples=500, deadline=None)
 settings.load_profile("repeatable")
 
 _TEMPORARY = pytest.StashKey[tempfile.TemporaryDirectory]()
+_BEFORE = pytest.StashKey[tuple[str, str | None]]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -30,10 +31,16 @@ def pytest_configure(config: pytest.Config) -> None:
 
     pytest's own folders (`tmp_path`) stay where they are, so that those of a failed test can be looked at.
     """
+    config.stash[_BEFORE] = tempfile.gettempdir(), os.environ.get("TMPDIR")
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", tempfile.gettempdir())
     config.stash[_TEMPORARY] = tempfile.TemporaryDirectory(prefix="crashkit-tests-", ignore_cleanup_errors=True)
     os.environ["TMPDIR"] = tempfile.tempdir = config.stash[_TEMPORARY].name
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
+    tempfile.tempdir, variable = config.stash[_BEFORE]
+    if variable is None:
+        os.environ.pop("TMPDIR", None)
+    else:
+        os.environ["TMPDIR"] = variable
     config.stash[_TEMPORARY].cleanup()

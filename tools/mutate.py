@@ -24,13 +24,27 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("crashkit", "data_schema", "evaluation", "surrogates")
-KILLED = ("killed", "timeout", "segfault")
+# Exit codes that mutmut keeps: pytest's, or minus the signal.
+STATUS = {
+    0: "survived",
+    1: "killed",
+    3: "killed",
+    5: "no tests",
+    33: "no tests",
+    36: "timeout",
+    -24: "timeout",
+    -9: "timeout",
+    -11: "crash",
+    -6: "crash",
+}
+KILLED = ("killed", "timeout", "crash")
 
 
 @dataclass(frozen=True)
@@ -71,7 +85,8 @@ def main() -> int:
         outcomes.append(outcome)
         for mutant, change in outcome.survivors.items():
             print(f"\n{mutant}: {outcome.status[mutant]}\n{change}")
-        print(f"{name}: {outcome.killed} of {len(outcome.status)} killed (seed {given.seed})\n", flush=True)
+        how = ", ".join(f"{count} {status}" for status, count in Counter(outcome.status.values()).items())
+        print(f"{name}: {outcome.killed} of {len(outcome.status)} killed ({how}; seed {given.seed})\n", flush=True)
     if given.json:
         told = [{"file": o.file, "seed": given.seed, "status": o.status, "survivors": o.survivors} for o in outcomes]
         given.json.write_text(json.dumps(told, indent=1), encoding="utf-8")
@@ -109,14 +124,10 @@ def try_mutants(file: str, tests: list[str], sample: int, seed: int, jobs: int) 
         beside = {"PYTHONPATH": str(place / "mutants"), "OMP_NUM_THREADS": "1", "TMPDIR": str(place)}
         environment = {**os.environ, **beside}
         ran = mutmut(place, environment, "run", "--max-children", str(jobs), *chosen)
-        statuses = dict(
-            line.strip().rsplit(": ", 1)
-            for line in mutmut(place, environment, "results", "--all", "1").splitlines()
-            if ": " in line
-        )
-        if any(statuses.get(name, "not checked") == "not checked" for name in chosen):
-            raise SystemExit(f"{file}: mutmut stopped early\n{ran[-3000:]}")
-        status = {name: statuses[name] for name in chosen}
+        codes = json.loads((place / "mutants" / f"{file}.meta").read_text(encoding="utf-8"))["exit_code_by_key"]
+        status = {name: STATUS.get(codes[name], "not tried") for name in chosen}
+        if "not tried" in status.values():
+            raise SystemExit(f"{file}: tests could not be run against every mutant\n{ran[-3000:]}")
         lost = [name for name in chosen if status[name] not in KILLED]
         return Outcome(file, status, {name: mutmut(place, environment, "show", name).strip() for name in lost})
 
