@@ -23,7 +23,7 @@ from surrogates.data.samples import Notes, scale_of
 from surrogates.errors import SurrogateError
 from surrogates.physics.choice import Worth, choose
 from surrogates.physics.registration import Registration
-from surrogates.physics.trials import Courses, Folds, Machine, Trials, course_machine, courses_of
+from surrogates.physics.trials import Courses, Folds, Machine, Trials, courses_of
 from surrogates.regression.gaussian import Gaussian, RadialBasis
 from surrogates.settings import Settings
 
@@ -191,7 +191,7 @@ def fit_pod_regression(
     elif settings.pod.inputs == "auto" and registration.is_identity:
         candidates.append(_Candidate("point", registration, 0))
     counts = tuple(sorted({min(m, courses.own.shape[2]) for m in settings.pod.modes}))
-    if not folds.count:
+    if not len(folds.judged):
         best, count, errors = candidates[0], counts[-1], {}
         notes.add(
             f"{len(chosen)} runs cannot be told apart by folds; {count} modes and {best.view} inputs are taken unseen"
@@ -217,15 +217,15 @@ def _folds(campaign: Campaign, settings: Settings, chosen: NDArray[np.int64]) ->
     names = settings.validation.runs
     if names:
         named = np.array([campaign.runs[run] in names for run in chosen])
-        return Folds(np.where(named, 0, -1))
+        return Folds(np.where(named, 0, -1)[None])
     return Folds.of(len(chosen), settings.validation.folds, settings.seed)
 
 
 def _errors(candidate: _Candidate, trials: Trials, settings: Settings, counts: Sequence[int]) -> NDArray[np.float64]:
     """(count,) e2 (m) over the left-out runs with so many modes, each fold with modes of its own."""
     total, runs = np.zeros(len(counts)), 0
-    for part, held, course in _fold_courses(candidate, trials, settings):
-        turn = _rotation(part, max(counts))
+    for part, held, course, _ in _fold_courses(candidate, trials, settings):
+        turn = _rotation(part)
         for place, count in enumerate(counts):
             some = turn(count)
             total[place] += trials.distances(held, np.asarray((course @ some) @ some.T, np.float32)).sum()
@@ -235,19 +235,19 @@ def _errors(candidate: _Candidate, trials: Trials, settings: Settings, counts: S
 
 def _fold_courses(
     candidate: _Candidate, trials: Trials, settings: Settings
-) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32]]]:
-    """Of each fold: courses that trained, places of the runs left out, and their predicted courses (run, state, mode)."""
+) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32], NDArray[np.float64]]]:
+    """Of each fold: courses that trained, places of the runs left out, their predicted courses, deviations (run,)."""
     if candidate.view == "trajectory":
         values = trials.values(candidate.registration, candidate.plane)
         splits = [trials.with_images(candidate.registration, train) for train, _ in trials.folds]
-        found = trials.predicted(candidate.registration, candidate.plane)
-        for part, (held, course) in zip(splits, found, strict=True):
-            yield values[part], held, course
+        found = trials.believed(candidate.registration, candidate.plane)
+        for part, (held, course, deviations) in zip(splits, found, strict=True):
+            yield values[part], held, course, deviations
         return
     for train, held in trials.folds:
         core = _points_fitted(trials.courses, trials.parameters[train], train, settings)
         states = core.coefficients(trials.parameters[held], trials.courses.time)
-        yield trials.courses.own[train], held, states.astype(np.float32)
+        yield trials.courses.own[train], held, states.astype(np.float32), np.ones(len(held))
 
 
 def _best(errors: Mapping[_Candidate, NDArray[np.float64]], counts: Sequence[int]) -> tuple[_Candidate, int]:
@@ -272,11 +272,11 @@ def _fitted(candidate: _Candidate, trials: Trials, settings: Settings, count: in
     courses, registration = trials.courses, candidate.registration
     if candidate.view == "point":
         core = _points_fitted(courses, trials.parameters, np.arange(len(trials.parameters)), settings)
-        turn = _rotation(courses.own, count)(count)
+        turn = _rotation(courses.own)(count)
     else:
         inputs, values = trials.inputs(registration), trials.values(registration, candidate.plane)
-        machine = course_machine(settings.model, inputs, values, registration.inputs.mixed, settings.seed)
-        turn = _rotation(values, count)(count)
+        machine = trials.fitted(registration, inputs, values)
+        turn = _rotation(values)(count)
         data = Coefficients(over_range(inputs, inputs), registration.grid, values)
         core = PodRegression(courses.modes, data, machine, "trajectory", inputs.min(axis=0), inputs.max(axis=0))
     core.modes = np.ascontiguousarray(courses.modes @ turn)
@@ -297,7 +297,7 @@ def _points_fitted(
     return PodRegression(courses.modes, data, machine, "point", low, high, samples)
 
 
-def _rotation(values: NDArray[np.float32], largest: int) -> Callable[[int], NDArray[np.float32]]:
+def _rotation(values: NDArray[np.float32]) -> Callable[[int], NDArray[np.float32]]:
     """From the common basis to the first modes of courses (run, state, mode): count -> (mode, count), orthonormal.
 
     From a few modes on, the structure's translations are the first ones, so that a motion as a whole is kept exactly.
@@ -317,13 +317,11 @@ def _rotation(values: NDArray[np.float32], largest: int) -> Callable[[int], NDAr
 
 
 def _held(candidate: _Candidate, trials: Trials, settings: Settings, count: int) -> Iterator[Held]:
-    deviations = trials.deviations(candidate.registration, candidate.plane) if candidate.view == "trajectory" else None
-    for part, held, course in _fold_courses(candidate, trials, settings):
-        turn = _rotation(part, count)(count)
+    for part, held, course, deviations in _fold_courses(candidate, trials, settings):
+        turn = _rotation(part)(count)
         modes = (trials.courses.modes @ turn).astype(np.float32)
-        for run, states in zip(held, course @ turn, strict=True):
-            deviation = 1.0 if deviations is None else float(deviations[run])
-            yield Held(int(run), (states @ modes.T).reshape(len(states), -1, 3), deviation)
+        for run, states, deviation in zip(held, course @ turn, deviations, strict=True):
+            yield Held(int(run), (states @ modes.T).reshape(len(states), -1, 3), float(deviation))
 
 
 def _points(data: Coefficients) -> NDArray[np.float64]:

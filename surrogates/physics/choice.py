@@ -59,13 +59,17 @@ class Worth:
 
 @dataclass(frozen=True)
 class _Way:
-    """One registration to be tried; `plane` is a place in the campaign's mirrors, None for no images."""
+    """One registration to be tried; `plane` is a place in the campaign's mirrors, None for no images.
+
+    whole  whether the likelihood counts courses beyond the reference's end
+    """
 
     inputs: DerivedInputs
     exponents: tuple[tuple[int, float], ...] = ()
     plane: int | None = None
     odd: tuple[str, ...] = ()
     flagged: bool = False
+    whole: bool = False
 
 
 class _Search:
@@ -87,7 +91,9 @@ class _Search:
             clock = Clock.of(self.parameters, way.exponents[0][0], dict(way.exponents), float(self.campaign.time[0]))
         mirror = None if way.plane is None else self.campaign.mirrors[way.plane]
         symmetry = Symmetry() if mirror is None else Symmetry(mirror, way.odd, way.flagged)
-        return Registration(way.inputs, clock, symmetry, clock.grid(self.parameters, self.campaign.time))
+        grid = clock.grid(self.parameters, self.campaign.time)
+        reach = np.inf if way.whole or not way.exponents else float(self.campaign.time[-1])
+        return Registration(way.inputs, clock, symmetry, grid, reach)
 
     def error(self, way: _Way) -> float:
         self.tried.add(way)
@@ -181,7 +187,8 @@ class _Search:
             return way
         speed, exponents = way.exponents[0][0], dict(way.exponents)
         options = [replace(way, exponents=_sorted(speed, e)) for e in neighbours(exponents, speed, self.others)]
-        return self.best([way, replace(way, exponents=()), *options])
+        way = self.best([way, replace(way, exponents=()), *options])
+        return self.best([way, replace(way, whole=not way.whole)]) if way.exponents else way
 
     def improved_symmetry(self, way: _Way) -> _Way:
         if way.plane is None:

@@ -31,12 +31,15 @@ class Registration:
 
     inputs, clock, symmetry  see `surrogates.physics`
     grid                     (state,) s, the reference's times on which registered runs are given
+    reach                    s, how far courses count in a process's likelihood: to the reference's own end, or all along.
+                             Beyond that end most courses are their last slope going on
     """
 
     inputs: DerivedInputs
     clock: Clock
     symmetry: Symmetry
     grid: NDArray[np.float64]
+    reach: float = np.inf
 
     @classmethod
     def identity(cls, names: tuple[str, ...], time: NDArray[np.float64]) -> Registration:
@@ -130,6 +133,7 @@ class Registration:
             "clock": self.clock.as_dict(),
             "symmetry": self.symmetry.as_dict(),
             "grid": self.grid.tolist(),
+            "reach": self.reach if np.isfinite(self.reach) else None,
         }
 
     @classmethod
@@ -140,6 +144,7 @@ class Registration:
             Clock.from_dict(values["clock"]),
             Symmetry.from_dict(values["symmetry"]),
             np.array(values["grid"], np.float64),
+            np.inf if values["reach"] is None else float(values["reach"]),
         )
 
 

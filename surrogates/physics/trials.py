@@ -34,11 +34,16 @@ _JUDGED_NODES, _JUDGED_STATES = 400, 21
 _LIKELIHOOD_STATES = 21
 # Up to so many runs each is left out in turn.
 _LEAVE_ONE = 12
+# How often they are parted anew, by the largest number of runs.
+_ROUNDS = ((32, 3), (64, 2), (1 << 62, 1))
 
 
 @dataclass(frozen=True)
 class Folds:
-    """Training runs in parts that are left out in turn: part (run,) of each."""
+    """Training runs in parts that are left out in turn, several times over where runs are few.
+
+    part  (round, run): the part in which each run is left out; -1: never
+    """
 
     part: NDArray[np.int64]
 
@@ -46,21 +51,26 @@ class Folds:
     def of(cls, runs: int, count: int, seed: int) -> Folds:
         """`count` parts of about the same size, drawn by the seed; each run its own part where there are few, none for one or two."""
         if runs < 3:
-            return cls(np.full(runs, -1))
-        count = runs if runs <= max(_LEAVE_ONE, count) else count
-        part = np.empty(runs, np.int64)
-        part[np.random.default_rng(seed).permutation(runs)] = np.arange(runs) % count
+            return cls(np.full((1, runs), -1))
+        if runs <= max(_LEAVE_ONE, count):
+            return cls(np.arange(runs)[None])
+        draw = np.random.default_rng(seed)
+        rounds = next(rounds for most, rounds in _ROUNDS if runs <= most)
+        part = np.empty((rounds, runs), np.int64)
+        for row in part:
+            row[draw.permutation(runs)] = np.arange(runs) % count
         return cls(part)
 
     @property
-    def count(self) -> int:
-        """How many times some runs are left out."""
-        return int(self.part.max(initial=-1)) + 1
+    def judged(self) -> NDArray[np.int64]:
+        """Places of the runs that are left out at some time."""
+        return np.flatnonzero((self.part >= 0).any(axis=0))
 
     def __iter__(self) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-        """Places of the runs that train, and of those left out; runs of part -1 are never left out."""
-        for k in range(self.count):
-            yield np.flatnonzero(self.part != k), np.flatnonzero(self.part == k)
+        """Places of the runs that train, and of those left out."""
+        for row in self.part:
+            for k in range(int(row.max(initial=-1)) + 1):
+                yield np.flatnonzero(row != k), np.flatnonzero(row == k)
 
 
 @dataclass
@@ -135,15 +145,17 @@ class Trials:
     def errors(self, registration: Registration, plane: int = 0) -> NDArray[np.float64]:
         """(run,) e2, m, of each run, predicted without it; NaN for those that are never left out."""
         key = f"{plane} {registration.inputs} {registration.clock} {registration.symmetry.odd} " + str(
-            (registration.symmetry.is_identity, registration.symmetry.flagged)
+            (registration.symmetry.is_identity, registration.symmetry.flagged, registration.reach)
         )
         if key not in self._known:
-            out = np.full(len(self.parameters), np.nan)
+            out, rounds = np.zeros(len(self.parameters)), np.zeros(len(self.parameters))
             try:
                 for held, coefficients in self.predicted(registration, plane):
-                    out[held] = self.distances(held, coefficients)
+                    out[held] += self.distances(held, coefficients)
+                    rounds[held] += 1
             except SurrogateError:  # inputs that radial basis functions cannot tell apart
-                out[self.folds.part >= 0] = np.inf
+                out[self.folds.judged], rounds[self.folds.judged] = np.inf, 1
+            out = np.where(rounds > 0, out / np.maximum(rounds, 1), np.nan)
             self._known[key] = out
         return self._known[key]
 
@@ -151,6 +163,12 @@ class Trials:
         self, registration: Registration, plane: int = 0
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32]]]:
         """Places of the left-out runs of each fold, and what the others say of them, (run, state, mode)."""
+        return ((held, course) for held, course, _ in self.believed(registration, plane))
+
+    def believed(
+        self, registration: Registration, plane: int = 0
+    ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float64]]]:
+        """As `predicted`, and the deviation (run,) that the process believes to have, up to a factor."""
         inputs, values = self.inputs(registration), self.values(registration, plane)
         start = None
         for train, held in self.folds:
@@ -167,18 +185,9 @@ class Trials:
                 out = (machine.weights(scaled).astype(np.float32) @ flat).reshape(len(x), *values.shape[1:])
                 return _at(out, registration.grid, time)
 
-            yield held, registration.undo(course, self.parameters[held], self.courses.time).astype(np.float32)
-
-    def deviations(self, registration: Registration, plane: int = 0) -> NDArray[np.float64]:
-        """(run,): what the process of the other folds believes its error to be, up to a factor."""
-        inputs, values = self.inputs(registration), self.values(registration, plane)
-        out = np.ones(len(self.parameters))
-        for train, held in self.folds:
-            part = self.with_images(registration, train)
-            machine = self.fitted(registration, inputs[part], values[part])
-            if isinstance(machine, Gaussian):
-                out[held] = machine.deviation(over_range(inputs[held], inputs[part]))
-        return out
+            said = registration.undo(course, self.parameters[held], self.courses.time).astype(np.float32)
+            x = over_range(inputs[held], inputs[part])
+            yield held, said, machine.deviation(x) if isinstance(machine, Gaussian) else np.ones(len(held))
 
     def likelihood(self, registration: Registration, plane: int = 0) -> float:
         """Of all training runs, for each sample and output: compares inputs of one clock."""
@@ -194,6 +203,7 @@ class Trials:
         start: Kernel | None = None,
     ) -> Machine:
         """The regression of courses (run, state, mode) by inputs (run, input)."""
+        values = values[:, registration.grid <= registration.reach * (1 + 1e-9)]
         return course_machine(self.machine, inputs, values, registration.inputs.mixed, self.seed, start)
 
     def inputs(self, registration: Registration) -> NDArray[np.float64]:
