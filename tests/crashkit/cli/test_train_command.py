@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import warnings
 from pathlib import Path
 
+import netCDF4
 import numpy as np
 import plate
 import pytest
@@ -255,11 +257,78 @@ def test_parameters_in_other_units_are_the_same(model: Path) -> None:
 
 
 def test_outside_the_trained_range_there_is_a_warning_with_the_range(model: Path, tmp_path: Path) -> None:
-    with pytest.warns(UserWarning, match=r"impact_speed = 99 m s-1 is outside the trained range 1\d"):
-        predict(model, {**ASKED, "impact_speed": 99})
-    code, _, err = run("predict", model, "--param", "impact_speed=99", *asked(model)[4:], "-o", tmp_path / "run.npz")
+    speed = load(model).record.ranges.high[0] + 1
+    with pytest.warns(UserWarning, match=rf"impact_speed = {speed:g} m s-1 is outside the trained range 1\d"):
+        predict(model, {**ASKED, "impact_speed": speed})
+    rest = asked(model)[4:]
+    code, _, err = run("predict", model, "--param", f"impact_speed={speed}", *rest, "-o", tmp_path / "run.npz")
     assert code == 0
-    assert "warning: impact_speed = 99 m s-1 is outside the trained range" in err
+    assert f"warning: impact_speed = {speed:g} m s-1 is outside the trained range" in err
+
+
+def test_far_outside_nothing_is_predicted_unless_asked(model: Path, tmp_path: Path) -> None:
+    rest = asked(model)[4:]
+    far = ("predict", model, "--param", "impact_speed=99", *rest, "-o", tmp_path / "run.npz")
+    code, _, err = run(*far)
+    assert code == 1
+    assert "impact_speed = 99 m s-1 is outside the trained range" in err
+    assert "--extrapolate" in err
+    assert list(tmp_path.iterdir()) == []
+    assert run(*far, "--extrapolate")[0] == 0
+    with pytest.raises(DataError, match=r"time = 0\.1 s is outside"):
+        predict(model, ASKED, time=[0.1])
+
+
+def test_bare_numbers_are_in_the_unit_of_the_table(crash: Path, tmp_path: Path) -> None:
+    path = Path(shutil.copy(crash, tmp_path / "table.nc"))
+    with netCDF4.Dataset(path, "a") as file:
+        file["yield_stress"].table_units = "MPa"
+    crashkit.train(path, tmp_path / "m", "podnn", overrides=["level.epochs=1"], device="cpu")
+    plain = {"impact_speed": "20", "impact_angle": "5"}
+    np.testing.assert_array_equal(
+        predict(tmp_path / "m", {**plain, "yield_stress": "400"}),
+        predict(tmp_path / "m", {**plain, "yield_stress": 4e8}),
+    )
+    with pytest.raises(DataError, match=r"the model takes .*yield_stress \(\d\d\d(\.\d+)? to \d\d\d(\.\d+)? MPa\)"):
+        predict(tmp_path / "m", {})
+    assert "| yield_stress | MPa |" in (tmp_path / "m" / "card.md").read_text()
+    told = run("info", tmp_path / "m")[1]
+    assert re.search(r"yield_stress.*MPa", told)
+
+
+def test_a_table_of_runs_is_predicted(model: Path, tmp_path: Path) -> None:
+    table = tmp_path / "table.csv"
+    table.write_text("run,impact_speed [km/h],impact_angle,yield_stress [MPa],note\na,72,5,400,1\nb,60,5,400,2\n")
+    code, out, err = run("predict", model, "--params", table, "-o", tmp_path / "many", "--json")
+    assert code == 0, err
+    assert [(r["run"], r["nodes"]) for r in json.loads(out)] == [("a", 81), ("b", 81)]
+    _, mesh = read_state(tmp_path / "many" / "a.pvd", -1)
+    expected = load(model).predict_full([20.0, 5.0, 4e8])[-1]
+    np.testing.assert_allclose(mesh["displacement"], expected, atol=1e-6)
+    assert mesh.field_data["impact_speed"].tolist() == [20.0]
+    assert list(mesh.field_data["model_name"]) == ["MH1 of mh"]
+
+
+@pytest.mark.parametrize("level", [None, 2])
+def test_a_run_of_the_dataset_stands_beside_its_prediction(
+    crash: Path, model: Path, tmp_path: Path, level: int | None
+) -> None:
+    at = () if level is None else ("--level", level)
+    wanted = ("predict", model, "--run", "run_008", "--dataset", crash, *at, "-o", tmp_path / "run.vtkhdf")
+    code, out, err = run(*wanted, "--json")
+    assert code == 0, err
+    _, mesh = read_state(tmp_path / "run.vtkhdf", -1)
+    nodes = slice(None) if level is None else plate.levels()[1].kept
+    with xr.open_dataset(crash) as data:
+        np.testing.assert_array_equal(mesh["displacement"], data["displacement"].sel(sim="run_008").values[-1, nodes])
+        np.testing.assert_array_equal(mesh["node_id"], data["node_id"].values[nodes])
+    np.testing.assert_allclose(
+        mesh["error"], np.linalg.norm(mesh["predicted"] - mesh["displacement"], axis=1), rtol=1e-5
+    )
+    assert not any("says nothing about new runs" in said for said in json.loads(out)["warnings"])
+    assert 0 < json.loads(out)["mean_error_m"] < json.loads(out)["largest_error_m"]
+    seen = run("predict", model, "--run", "run_000", "--dataset", crash, "-o", tmp_path / "seen.npz")[2]
+    assert re.search(r"the model was (trained|tuned) on run_000", seen)
 
 
 def test_inside_the_trained_range_there_is_none(model: Path) -> None:
@@ -274,6 +343,7 @@ def test_inside_the_trained_range_there_is_none(model: Path) -> None:
         ({"speed": 3}, r"'speed' is not known; the model takes impact_speed \(.* m s-1\), impact_angle"),
         ({"impact_speed": None}, r"impact_speed is missing; the model takes"),
         ({"impact_speed": "fast"}, "expected a number"),
+        ({"impact_speed": "20,5"}, "the decimal sign is a point"),
         ({"impact_speed": "20 MPa"}, "'MPa' is not one of impact_speed, which is in m s-1"),
         ({"impact_speed": float("nan")}, "expected a finite number"),
     ],
@@ -291,6 +361,8 @@ def test_wrong_parameters_are_named(model: Path, change: dict[str, object], mess
         (("-o", "run.vtu"), 1, "holds one state, and 7 were asked for"),
         (("-o", "run.npz", "--level", "7"), 1, "level 7 was asked for"),
         (("-o", "run.npz", "--time", "soon"), 2, "expected seconds"),
+        (("-o", "run.npz", "--time", "0.02,0.01"), 2, "expected increasing times"),
+        (("-o", "run.npz", "--run", "run_001"), 2, "give one of --param, --params and --run"),
         (("-o", "run.npz", "--param", "impact_speed"), 2, "expected name=value"),
     ],
 )
