@@ -75,16 +75,58 @@ class Known:
         """The error over the box, by runs that were left out while the process was trained."""
         from surrogates.design.judgement import judge
 
-        left_out = self.surrogate.record.left_out
-        if len(left_out) < 2:
-            raise CampaignError("the model knows no errors of left-out runs; train it with more runs")
-        errors, deviations = np.array(list(left_out.values()), np.float64).T
-        return judge(errors, deviations, self.deviation(self.points(seed, _OVER)), confidence, seed)
+        ratios, _ = self._ratios()
+        return judge(ratios, np.ones(len(ratios)), self.deviation(self.points(seed, _OVER)), confidence, seed)
 
     def deviation(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """(point,): what the process believes its error to be at points of the box, up to a factor."""
         core, registration = _process(self.surrogate)
-        return core.deviation(registration.read(self.parameters(points)))
+        parameters = self.parameters(points)
+        return core.deviation(registration.read(parameters)) * self.size(parameters)
+
+    def size(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(point,): how large errors at (point, parameter) are for one unit of the process's deviation, up to a factor.
+
+        The process lives on the reference's clock and size. A run of higher speed moves further, and goes further along
+        the course, where runs are further apart: size of the run times the mean spread of the training runs over the
+        part of the course that it goes through.
+        """
+        core, registration = _process(self.surrogate)
+        courses = core.data.values.astype(np.float64)
+        spread = np.sqrt(((courses - courses.mean(axis=0)) ** 2).sum(axis=2).mean(axis=0))
+        out = registration.clock.size(parameters)
+        for k, one in enumerate(parameters):
+            passed = registration.clock.times(one, self.surrogate.record.time)
+            out[k] *= np.interp(passed, core.data.time, spread).mean()
+        return np.asarray(out)
+
+    def wrongness(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(point,): how often the error of left-out runs near (point, parameter) was what the process expected, squared.
+
+        The ratios of error to deviation of left-out runs, averaged with the process's own correlation as weight: where
+        the process is wrong rather than far from runs, as at a fold, it is above its mean of about 1.
+        """
+        core, registration = _process(self.surrogate)
+        ratios, runs = self._ratios()
+        kernel = core.machine.kernel
+        corners = np.stack([core.low, core.high])
+        from surrogates.data.inputs import over_range
+
+        here, there = (over_range(registration.read(p), corners) for p in (parameters, runs))
+        distance = np.sqrt(3 * (((here @ kernel.mix.T)[:, None] - (there @ kernel.mix.T)[None]) ** 2).sum(axis=2))
+        near = (1 + distance) * np.exp(-distance) + 1e-3
+        local = (near @ ratios**2) / near.sum(axis=1)
+        return np.asarray(local / np.mean(ratios**2))
+
+    def _ratios(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Error over deviation of each left-out run, and its parameters (run, parameter)."""
+        record = self.surrogate.record
+        if len(record.left_out) < 2:
+            raise CampaignError("the model knows no errors of left-out runs; train it with more runs")
+        places = [record.fitted_runs.index(name) for name in record.left_out]
+        runs = np.array([record.parameters[n] for n in record.ranges.names], np.float64).T[places]
+        errors, deviations = np.array(list(record.left_out.values()), np.float64).T
+        return errors / (deviations * self.size(runs)), runs
 
     def posterior(self, known: NDArray[np.float64]) -> Posterior:
         """The belief behind it, for runs at `known` (run, parameter) in the units of the model."""
@@ -113,7 +155,7 @@ class Known:
 
         over, candidates = self.points(seed, _OVER), self.points(seed + 1, _CANDIDATES)
         belief = self.posterior(known)
-        method = ExpectedReduction(belief, self.parameters(over))
+        method = ExpectedReduction(belief, self.parameters(over), self.size(self.parameters(over)) ** 2)
         chosen = method.ask(self.parameters(candidates), count)
         found = self.parameters(candidates)
         share = self.fall(known, chosen, seed)
@@ -123,8 +165,10 @@ class Known:
     def fall(self, known: NDArray[np.float64], points: NDArray[np.float64], seed: int) -> float:
         """The mean deviation over the box with runs at `points` against that without, all in the units of the model."""
         over, belief = self.parameters(self.points(seed, _OVER)), self.posterior(known)
-        before = np.sqrt(belief.variance(over) + belief.noise).mean()
-        return float(np.sqrt(belief.with_runs(points).variance(over) + belief.noise).mean() / before)
+        size = self.size(over)
+        before = (size * np.sqrt(belief.variance(over) + belief.noise)).mean()
+        after = (size * np.sqrt(belief.with_runs(points).variance(over) + belief.noise)).mean()
+        return float(after / before)
 
 
 def _process(surrogate: Surrogate):  # type: ignore[no-untyped-def]

@@ -119,7 +119,7 @@ class Dask:
         except ImportError as error:
             raise CampaignError("a Dask scheduler needs dask; pip install 'crashkit[distributed]'") from error
         try:
-            self._client = Client(scheduler, timeout=10)
+            self._client = Client(scheduler, timeout=5)
         except OSError as error:
             raise CampaignError(f"{scheduler}: no Dask scheduler answers there ({error})") from error
         self._futures: dict[str, Any] = {}

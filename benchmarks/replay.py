@@ -1,0 +1,159 @@
+"""Proposals among runs that are computed already: error against the number of runs, for several ways to choose them.
+
+    python benchmarks/replay.py crash.zarr --judged 96:128 [--pool 0:96,128:256] [--starts 10] [--first 16] [--batch 8]
+                                [--counts 24 48] [--odd pole_offset] [--folds] [--local] [--json FILE]
+
+Each start draws `--first` runs of the pool at random. Then `--batch` runs at a time are asked for among the rest of the pool
+by the expected reduction of the error over the box (`surrogates.design.criteria`), with everything chosen anew by folds
+over the runs chosen so far. Against it stand random subsets (the same starts, filled up at random) and blocks of consecutive
+runs of the pool, which is a Halton sequence: one prefix may be lucky, so the mean over blocks counts. The error is the mean
+node distance over runs that nobody chooses: `--judged`, or with `--folds` a quarter of the pool that is left out of each
+start's pool in turn. The estimate of `crashkit campaign` at the last count is compared with that error.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crashkit.api._design import Known
+from crashkit.api.campaign import open_campaign
+from crashkit.campaign.box import Box
+from crashkit.selection import runs_of
+from surrogates.data.campaign import Campaign
+from surrogates.design.criteria import ExpectedReduction
+from surrogates.settings import settings
+from surrogates.surrogate import Surrogate
+from surrogates.training.train import train
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("dataset", type=Path)
+    parser.add_argument("--judged", default="", help="runs that nobody chooses")
+    parser.add_argument("--pool", default="", help="runs to choose among, ranges with commas; default: all others")
+    parser.add_argument("--folds", action="store_true", help="judge each start on a quarter of the pool")
+    parser.add_argument("--starts", type=int, default=10)
+    parser.add_argument("--first", type=int, default=16)
+    parser.add_argument("--batch", type=int, default=8)
+    parser.add_argument("--counts", type=int, nargs="+", default=[24, 48])
+    parser.add_argument("--local", action="store_true", help="weigh places by the errors of left-out runs around them")
+    parser.add_argument("--odd", nargs="*", default=[])
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+
+    whole = open_campaign(args.dataset, symmetry=True)
+    memory = np.stack([np.asarray(whole.displacement(0)[k]) for k in range(len(whole.parameters))])
+    whole = replace(whole, displacement=lambda level: memory)
+    names = list(whole.runs)
+    judged = runs_of(names, args.judged) if args.judged else []
+    pool = (
+        sorted({k for part in args.pool.split(",") for k in runs_of(names, part)}) if args.pool else range(len(names))
+    )
+    pool = [k for k in pool if k not in set(judged)]
+    replay = Replay(whole, memory, args.odd, args.batch, args.local)
+    out: dict[str, Any] = {"random": {}, "halton": {}, "expected-reduction": {}, "estimate": []}
+    for start in range(args.starts):
+        rng = np.random.default_rng(start)
+        fold = judged
+        own = pool
+        if args.folds:
+            parts = np.array_split(np.random.default_rng(start // 4).permutation(pool), 4)
+            fold = sorted(parts[start % 4].tolist())
+            own = [k for k in pool if k not in set(fold)]
+        first = rng.choice(own, args.first, replace=False).tolist()
+        for method in ("random", "halton", "expected-reduction"):
+            for count, (error, estimate) in replay.course(method, first, own, fold, args.counts, start).items():
+                out[method].setdefault(count, []).append(error)
+                if method == "expected-reduction" and count == max(args.counts):
+                    out["estimate"].append([error, *estimate])
+        show(out, args.counts)
+        if args.json:
+            args.json.write_text(json.dumps(out))
+
+
+class Replay:
+    """Trains on subsets of computed runs, and asks which to take next."""
+
+    def __init__(self, whole: Campaign, memory: NDArray[np.float32], odd: list[str], batch: int, local: bool) -> None:
+        self.local = local
+        self.whole, self.memory, self.odd, self.batch = whole, memory, odd, batch
+        self.box = Box.of_values(whole.parameter_names, whole.parameter_units, whole.parameters)
+
+    def course(
+        self, method: str, first: list[int], pool: list[int], judged: list[int], counts: list[int], start: int
+    ) -> dict[int, tuple[float, tuple[float, float, float]]]:
+        """Error (m), and the estimate with its 90 % interval, at each of `counts` runs."""
+        rng = np.random.default_rng(1000 + start)
+        rest = [k for k in pool if k not in set(first)]
+        chosen, out = list(first), {}
+        if method == "random":
+            chosen += rng.permutation(rest)[: max(counts) - len(first)].tolist()
+        if method == "halton":
+            begin = start * max(counts) // 2 % max(1, len(pool) - max(counts) + 1)
+            chosen = pool[begin : begin + max(counts)]
+        while True:
+            done = method != "expected-reduction"
+            for count in counts if done else [len(chosen)]:
+                if count in counts or not done:
+                    surrogate = self.train(chosen[:count])
+                    if count in counts:
+                        judgement = Known.of(surrogate, self.box).judge(0.9)
+                        out[count] = (self.error(surrogate, judged), (judgement.error, judgement.low, judgement.high))
+            if done or len(chosen) >= max(counts):
+                return out
+            chosen += self.ask(surrogate, chosen, pool)
+
+    def train(self, runs: list[int]) -> Surrogate:
+        some = replace(
+            self.whole, parameters=self.whole.parameters[runs], runs=tuple(self.whole.runs[k] for k in runs),
+            displacement=lambda level: self.memory[runs],
+        )  # fmt: skip
+        told = [f"physics.odd=[{', '.join(self.odd)}]"] if self.odd else []
+        return train(some, settings("pod-gpr", overrides=told))
+
+    def ask(self, surrogate: Surrogate, chosen: list[int], pool: list[int]) -> list[int]:
+        known = Known.of(surrogate, self.box)
+        left = [k for k in pool if k not in set(chosen)]
+        over = known.parameters(known.points(0, 512))
+        weights = known.size(over) ** 2
+        if self.local:
+            weights = weights * known.wrongness(over)
+        method = ExpectedReduction(known.posterior(self.whole.parameters[chosen]), over, weights)
+        asked = method.ask(self.whole.parameters[left], self.batch)
+        return [left[int(np.flatnonzero((self.whole.parameters[left] == row).all(axis=1))[0])] for row in asked]
+
+    def error(self, surrogate: Surrogate, judged: list[int]) -> float:
+        errors = []
+        for k in judged:
+            predicted = surrogate.predict(self.whole.parameters[k], self.whole.time, 0)
+            errors.append(float(np.nanmean(np.linalg.norm(predicted - self.memory[k], axis=-1))))
+        return float(np.mean(errors))
+
+
+def show(out: dict[str, Any], counts: list[int]) -> None:
+    """The table so far, in mm, with the standard error of the mean over starts."""
+    print(f"{len(out['random'][counts[0]])} starts, mean error in mm (standard error), ratios to random and Halton")
+    for count in counts:
+        means = {m: np.mean(out[m][count]) for m in ("random", "halton", "expected-reduction")}
+        cells = [
+            f"{m} {1e3 * means[m]:.2f} ({1e3 * np.std(out[m][count]) / np.sqrt(len(out[m][count])):.2f})" for m in means
+        ]
+        asked = means["expected-reduction"]
+        print(f"{count:4d} runs: {', '.join(cells)}; {asked / means['random']:.3f}, {asked / means['halton']:.3f}")
+    found = np.array(out["estimate"])
+    ratio, inside = found[:, 1] / found[:, 0], (found[:, 2] <= found[:, 0]) & (found[:, 0] <= found[:, 3])
+    print(
+        f"estimate / true: {ratio.mean():.3f} +- {ratio.std():.3f}; 90 % interval holds {inside.sum()} of {len(inside)}",
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    main()
