@@ -113,6 +113,10 @@ def show(summary: IngestSummary) -> None:
     ]
     told = ", ".join(f"{count} {what}" for count, what in counts if count)
     resumed = f"; {summary.resumed} were read by an earlier start" if summary.resumed else ""
+    if summary.scale is not None:
+        say(f"  {summary.scale}")
+    if summary.question:
+        say(f"  {summary.question}")
     say(f"{summary.output}: {len(summary.runs)} runs ({told}{resumed}), {summary.states} states, {summary.nodes} nodes")
 
 

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from crashkit.errors import CrashkitError, DataError, OutputError, ReadError
 from crashkit.ingestion.alignment import common_time, reach, same_time
 from crashkit.ingestion.assembly import Existing, publish
+from crashkit.ingestion.scale import Scale
 from crashkit.ingestion.staging import BackgroundHashes, StagedRun, Staging, key_of
 from crashkit.ingestion.store import check_output, recover
 from crashkit.ingestion.structure import Structure
@@ -29,6 +30,7 @@ from crashkit.ingestion.survey import Choice, Found, Survey, described, reader_o
 from crashkit.ingestion.transfer import Layout, is_whole, let_memory_go, transfer
 from crashkit.parallel import as_finished
 from crashkit.version import __version__
+from data_schema import run_checksum
 
 if TYPE_CHECKING:
     from crashkit.mesh.levels import Hierarchy
@@ -46,6 +48,8 @@ class IngestSummary:
     skipped          run -> why it is not in the dataset
     alignment_error  run -> estimated error of the change to the common times, m; of the runs written now
     notes            what else is worth knowing, such as parts left out
+    scale            size, duration, largest displacement and speed of the runs written now
+    question         what to ask where they are absurd, so that the units may be wrong; empty where they are not
     """
 
     output: Path
@@ -59,6 +63,8 @@ class IngestSummary:
     notes: tuple[str, ...] = ()
     nodes: int = 0
     states: int = 0
+    scale: Scale | None = None
+    question: str = ""
 
 
 def ingest(
@@ -176,6 +182,8 @@ class _Job:
             names = publish(staging, layout, fresh, staged, old, hashes)
         if hierarchy is not None:
             look.note(_carried(staging.output, hierarchy))
+        _note_equal_parameters(fresh, staged, old, look)
+        scale = _scale_of(fresh, staged, layout)
         before = set(former.names) if former else set()
         summary = IngestSummary(
             output=staging.output,
@@ -189,6 +197,8 @@ class _Job:
             notes=tuple(look.notes),
             nodes=layout.structure.n_nodes,
             states=len(layout.time),
+            scale=scale,
+            question=scale.question(fresh[0].units),
         )
         staging.discard()
         return summary
@@ -385,6 +395,41 @@ def _note_lost_end(time: NDArray[np.float64], runs: Sequence[Found], look: Surve
             f"the common times end at {time[-1]:g} s, since run {shortest.name} ends at {shortest.time[-1]:g} s; run "
             f"{longest.name} goes on to {longest.time[-1]:g} s"
         )
+
+
+def _scale_of(fresh: Sequence[Found], staged: Mapping[str, StagedRun], layout: Layout) -> Scale:
+    """Size, duration, displacement and speed of the runs that were read now."""
+    size = np.ptp(layout.structure.position, axis=0)
+    return Scale(
+        size=(float(size[0]), float(size[1]), float(size[2])),
+        duration=max(float(f.time[-1] - f.time[0]) for f in fresh),
+        displacement=max(staged[f.name].displacement for f in fresh),
+        speed=max(staged[f.name].speed for f in fresh),
+    )
+
+
+def _note_equal_parameters(
+    fresh: Sequence[Found], staged: Mapping[str, StagedRun], old: Existing | None, look: Survey
+) -> None:
+    """Say which runs have the same parameters: a surrogate can give them one result only."""
+    names = tuple(fresh[0].parameters) if fresh else ()
+    if not names:
+        return
+    seen: dict[tuple[float, ...], tuple[str, str]] = {}
+    replaced = {f.name for f in fresh}
+    for k, name in enumerate(old.names if old is not None else ()):
+        if old is not None and name not in replaced:
+            values = tuple(float(old.small[n].values[k]) for n in names)
+            seen.setdefault(values, (name, str(old.small["run_checksum"].values[k])))
+    for found in fresh:
+        values = tuple(found.parameters[n][0] for n in names)
+        checksum = run_checksum(staged[found.name].digests)
+        other, its = seen.setdefault(values, (found.name, checksum))
+        if other != found.name:
+            same = (
+                "the same result; is one a copy?" if its == checksum else "different results; is a parameter missing?"
+            )
+            look.note(f"runs {other} and {found.name} have equal parameters and {same}")
 
 
 def _hash(values: NDArray[Any]) -> str:

@@ -17,7 +17,7 @@ import os
 import shutil
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -35,12 +35,16 @@ class StagedRun:
         Of its arrays, by name (`data_schema.checksum.array_digest`).
     error
         Estimated error of the change to the common time, m.
+    displacement, speed
+        The largest of any living node, m and m/s.
     """
 
     key: str
     name: str
     digests: Mapping[str, str]
     error: float
+    displacement: float
+    speed: float
 
 
 class Staging:
@@ -72,8 +76,8 @@ class Staging:
         for line in self._lines():
             if "file" in line:
                 self.hashes[(line["file"], line["bytes"], line["changed"])] = line["sha256"]
-            else:
-                self.runs[line["key"]] = StagedRun(line["key"], line["name"], line["digests"], line["error"])
+            elif set(line) == {f.name for f in fields(StagedRun)}:  # one of another version is read again
+                self.runs[line["key"]] = StagedRun(**line)
         return self
 
     def __exit__(

@@ -69,6 +69,7 @@ def structure_of(
     parts: Sequence[str] = (),
     exclude_parts: Sequence[str] = (),
     keep_rigid_walls: bool = False,
+    without: tuple[NDArray[np.bool_], NDArray[np.bool_]] | None = None,
 ) -> Structure:
     """The structure of `mesh`. `parts` and `exclude_parts` name parts by number, title or glob pattern.
 
@@ -78,12 +79,17 @@ def structure_of(
         If a pattern matches no part, or if nothing is left.
     """
     chosen, notes = _choose(mesh.parts, parts, exclude_parts, keep_rigid_walls)
-    chosen = chosen[np.isin(chosen, mesh.face_part) | np.isin(chosen, mesh.cell_part)]  # empty parts say nothing
+    stay = (~without[0], ~without[1]) if without is not None else (slice(None), slice(None))
+    there = [mesh.face_part[stay[0]], mesh.cell_part[stay[1]]]
+    chosen = chosen[np.isin(chosen, there[0]) | np.isin(chosen, there[1])]  # empty parts say nothing
     new_part = np.full(len(mesh.parts) + 1, -1, np.int32)  # one more, so that part -1 (none) stays -1
     new_part[chosen] = np.arange(len(chosen))
 
-    shells = np.flatnonzero(new_part[mesh.face_part] >= 0)
-    cells = np.flatnonzero(new_part[mesh.cell_part] >= 0)
+    keep_faces, keep_cells = new_part[mesh.face_part] >= 0, new_part[mesh.cell_part] >= 0
+    if without is not None:
+        keep_faces &= ~without[0]
+        keep_cells &= ~without[1]
+    shells, cells = np.flatnonzero(keep_faces), np.flatnonzero(keep_cells)
     skin_nodes, skin_cell = _skin(mesh, cells)
     corners = _stack(mesh.face_nodes[shells], skin_nodes)
     if len(corners) == 0 and len(cells) == 0:

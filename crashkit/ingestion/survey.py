@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.errors import CrashkitError, DataError, ReadError
+from crashkit.ingestion.life import Dead, lives_at_start, never_alive
 from crashkit.ingestion.parameter_table import ParameterTable, read_parameter_table
 from crashkit.ingestion.structure import Structure, matched, structure_of
 from crashkit.readers import passed_over, reader_for
 from crashkit.readers._checks import reading
 from crashkit.readers._parameters import parameter_columns
-from crashkit.readers.base import FieldInfo, Run, Runs
+from crashkit.readers.base import FieldInfo, Run, RunMesh, Runs
 from data_schema import DIMENSIONS, VARIABLES, to_si, unit_system
 from data_schema.units import UnknownUnits, si_unit
 
@@ -51,10 +52,15 @@ class Choice:
     reader: str | None = None
     reader_options: tuple[tuple[str, str], ...] = ()
 
-    def structure(self, run: Run) -> Structure:
-        """The chosen structure of a run."""
+    def structure(self, run: Run, without: Dead | None = None) -> Structure:
+        """The chosen structure of a run, without the elements `without`."""
+        return self.of_mesh(run.mesh, without)
+
+    def of_mesh(self, mesh: RunMesh, without: Dead | None = None) -> Structure:
+        """The chosen structure of a mesh, without the elements `without`."""
         return structure_of(
-            run.mesh,
+            mesh,
+            without=without.of(mesh) if without else None,
             parts=self.parts,
             exclude_parts=self.exclude_parts,
             keep_rigid_walls=self.keep_rigid_walls,
@@ -104,13 +110,20 @@ class Found:
 
 @dataclass
 class Survey:
-    """What was found. `structure` is that of the first run (or of the dataset appended to), in metres."""
+    """What was found. `structure` is that of the first run (or of the dataset appended to, `appended`), in metres.
+
+    `dead` are the elements that live in no run so far, `reference` the first run's mesh and its length unit in metres
+    where there are any.
+    """
 
     found: list[Found] = field(default_factory=list)
     skipped: dict[str, str] = field(default_factory=dict)
     structure: Structure | None = None
     one_shape: bool = True
     notes: list[str] = field(default_factory=list)
+    appended: bool = False
+    dead: Dead | None = None
+    reference: tuple[RunMesh, float] | None = None
 
     def note(self, text: str) -> None:
         if text not in self.notes:
@@ -158,7 +171,7 @@ def survey(
         For what concerns all runs (unknown format, unreadable table, a field nobody has).
     """
     table = read_parameter_table(params) if params is not None else None
-    out = Survey(structure=structure)
+    out = Survey(structure=structure, appended=structure is not None)
     used: dict[str, str] = {}
     for source in sources:
         for index, name, run in each_run(source, choice, out, stop):
@@ -182,9 +195,25 @@ def survey(
     _refuse_short(out, choice, time, stop)
     if not out.found:
         raise DataError(f"no run can be used ({out.reasons()})")
+    _leave_out_dead(out, choice)
     for name in choice.fields:
         _note_missing(name, out)
     return out
+
+
+def _leave_out_dead(out: Survey, choice: Choice) -> None:
+    """Take the elements that live in no run out of the structure, and the nodes that only they use."""
+    if not out.dead or out.reference is None or out.structure is None or out.appended:
+        return
+    mesh, length = out.reference
+    reduced = choice.of_mesh(mesh, out.dead)
+    nodes = out.structure.n_nodes - reduced.n_nodes
+    elements = len(out.dead.faces) + len(out.dead.cells)
+    out.note(
+        f"{elements} element{'s' if elements > 1 else ''} that live{'' if elements > 1 else 's'} in no state of any run "
+        f"left out, and {nodes} node{'' if nodes == 1 else 's'} that nothing else uses"
+    )
+    out.structure = replace(reduced, position=reduced.position * length)
 
 
 def _row_of(table: ParameterTable, run: str, used: dict[str, str], out: Survey) -> str:
@@ -306,7 +335,17 @@ def _look(run: Run, name: str, source: Path, index: int, choice: Choice, out: Su
     for problem in problems:
         out.note(f"run {name} is incomplete: {problem}")
     system = unit_system(units)
+    dead = never_alive(run)
     structure = choice.structure(run)
+    if dead is not None:
+        if not lives_at_start(run, structure):
+            raise DataError(
+                f"{source}: no element lives in the first state (time {time[0]:g}); expected an element status of 1, or "
+                "not 0, for living elements: is it written the other way round?"
+            )
+        if out.appended and out.structure is not None:
+            dead = dead.outside(out.structure)
+            structure = choice.structure(run, dead)
     structure = replace(structure, position=structure.position * system.length)
     if not np.isfinite(structure.position).all():
         node = int(np.argmin(np.isfinite(structure.position).all(axis=1)))
@@ -315,7 +354,10 @@ def _look(run: Run, name: str, source: Path, index: int, choice: Choice, out: Su
         out.note(text)
     if out.structure is None:
         out.structure = structure
+        out.dead, out.reference = dead, None if dead is None else (run.mesh, system.length)
     else:
+        if not out.appended and out.dead is not None:
+            out.dead = out.dead.both(dead) if dead is not None else None
         structure = matched(out.structure, structure)
         size = float(np.ptp(out.structure.position, axis=0).max(initial=0.0))
         out.one_shape &= bool(np.abs(structure.position - out.structure.position).max(initial=0.0) <= SAME_SHAPE * size)

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from crashkit.errors import DataError
 from crashkit.ingestion.alignment import flags_at, interpolate, interpolation_error, same_time
 from crashkit.ingestion.curves import write_curves
+from crashkit.ingestion.life import never_alive
 from crashkit.ingestion.run_view import Flags, RunView, gone_nodes
 from crashkit.ingestion.staging import StagedRun
 from crashkit.ingestion.store import ArraySpec, create_arrays
@@ -38,6 +39,9 @@ from data_schema.validation import FIRST_STATE_TOLERANCE
 MEMORY_BYTES = 256 << 20
 # What is read from the source at once: memory of this size is used again and again, where larger is mapped anew.
 _PIECE_BYTES = 16 << 20
+# A displacement this many times the structure, or the displacements before it, is none; nor is one of this many metres.
+_LEAP, _FARTHEST = 1e3, 1e7
+_DIVERGED = "the solution diverged, or the file is damaged"
 # Blocks of nodes made, hashed, compressed and written at a time; each holds some 10 MB.
 THREADS = 4
 
@@ -113,14 +117,15 @@ def transfer(found: Found, layout: Layout, key: str, place: Path) -> StagedRun:
         run = reopen(found, layout.choice)
         try:
             with ThreadPoolExecutor(THREADS, thread_name_prefix="write") as pool:
-                digests, error = _Transfer(run, found, layout, beside, pool).write()
+                work = _Transfer(run, found, layout, beside, pool)
+                digests, error = work.write()
             write_curves(run, found.units, beside / "arrays")
         finally:
             run.close()
         put_in_place(beside / "arrays", place)
     finally:
         shutil.rmtree(beside, ignore_errors=True)
-    return StagedRun(key, found.name, digests, error)
+    return StagedRun(key, found.name, digests, error, work.displacement, work.speed)
 
 
 def is_whole(staged: StagedRun, place: Path) -> bool:
@@ -145,18 +150,28 @@ class _Transfer:
 
     def __init__(self, run: Run, found: Found, layout: Layout, folder: Path, pool: ThreadPoolExecutor) -> None:
         self._found, self._layout, self._pool = found, layout, pool
-        structure = matched(layout.structure, layout.choice.structure(run))
+        dead = never_alive(run)
+        left_out = None if dead is None else dead.outside(layout.structure)
+        structure = matched(layout.structure, layout.choice.structure(run, left_out))
         self._view = RunView(run, structure, unit_system(found.units))
         self._own, self._time = found.time, layout.time
         self._aligned = same_time(self._own, self._time)
         folder.mkdir()
         self._scratch = folder / "scratch"
         self._store = folder / "arrays"
+        self._size = float(np.linalg.norm(np.ptp(layout.structure.position, axis=0)))
+        self.displacement = self.speed = 0.0
+        self._before: Block | None = None
 
     def write(self) -> tuple[dict[str, str], float]:
         """Digests of the arrays that say something, and the estimated error of the change of times."""
-        faces, cells = self._alive()
-        gone = gone_nodes(self._view.structure, faces, cells, len(self._time))
+        own = self._alive()
+        self._gone = gone_nodes(self._view.structure, *own, len(self._own))
+        if self._aligned:
+            (faces, cells), gone = own, self._gone
+        else:
+            faces, cells = (None if f is None else flags_at(f, self._own, self._time) for f in own)
+            gone = gone_nodes(self._view.structure, faces, cells, len(self._time))
         specs = {s.name: s for s in self._layout.specs(alive=faces is not None, cell_alive=cells is not None)}
         absent = [n for n in self._layout.fields if n not in self._found.fields]
         self._arrays = create_arrays(self._store, [s for n, s in specs.items() if n not in absent], 1)
@@ -199,6 +214,7 @@ class _Transfer:
         node_id = self._view.structure.node_id
         if first == 0 and len(values):
             size = np.abs(np.nan_to_num(values[0])).max(axis=-1)
+            size = size if self._gone is None else np.where(self._gone[0], 0, size)
             node = int(size.argmax())
             if size[node] > FIRST_STATE_TOLERANCE:
                 raise DataError(
@@ -206,19 +222,39 @@ class _Transfer:
                     f"{size[node]:.3g} m; expected zero: are the first states missing, or are these positions and not "
                     "displacements?"
                 )
-        if np.isfinite(values).all():
-            return
-        bad = ~np.isfinite(values).all(axis=-1)
-        gone = gone_nodes(self._view.structure, *self._view.alive(first, first + len(values)), len(values))
-        if gone is not None:
-            bad &= ~gone
-        if bad.any():
-            state, node = map(int, np.argwhere(bad)[0])
+        for k, state in enumerate(values, first):
+            gone = None if self._gone is None else self._gone[k]
+            if not np.isfinite(state).all():
+                bad = ~np.isfinite(state).all(axis=-1)
+                if gone is not None:
+                    bad &= ~gone
+                if bad.any():
+                    node = int(np.argmax(bad))
+                    raise DataError(f"{self._place(k, node)} is {state[node].tolist()}; {_DIVERGED}")
+            self._measure(k, state, gone)
+
+    def _measure(self, k: int, state: Block, gone: NDArray[np.bool_] | None) -> None:
+        """Keep the largest displacement and speed so far; refuse a displacement (node, 3) that nothing can reach."""
+        living = state if gone is None else np.where(gone[:, None], np.float32(0), state)
+        node, largest = _longest(living)
+        if largest > _FARTHEST or (k > 0 and largest > _LEAP * max(self.displacement, self._size)):
             raise DataError(
-                f"{self._file(first + state)}: state {first + state} (time {self._own[first + state]:g} s), node "
-                f"{node_id[node]}: the displacement is {values[state, node].tolist()}; the solution diverged, or the "
-                "file is damaged"
+                f"{self._place(k, node)} is {largest:.3g} m long, that of the states before at most "
+                f"{self.displacement:.3g} m, in a structure of {self._size:.3g} m; {_DIVERGED}"
             )
+        if self._before is not None:
+            moved = living - self._before
+            before = None if self._gone is None else self._gone[k - 1]
+            for absent in (gone, before):  # a node that is gone stands at zero here
+                if absent is not None:
+                    moved[absent] = 0
+            self.speed = max(self.speed, _longest(moved)[1] / float(self._own[k] - self._own[k - 1]))
+        self.displacement = max(self.displacement, largest)
+        self._before = living
+
+    def _place(self, state: int, node: int) -> str:
+        number = self._view.structure.node_id[node]
+        return f"{self._file(state)}: state {state} (time {self._own[state]:g} s), node {number}: the displacement"
 
     def _file(self, state: int) -> str:
         """The file that holds a state, as far as that can be told."""
@@ -228,7 +264,7 @@ class _Transfer:
     # Erosion
 
     def _alive(self) -> tuple[Flags | None, Flags | None]:
-        """(state, face) and (state, cell) at the common times; None where nothing ever dies."""
+        """(state, face) and (state, cell) at the run's own times; None where nothing ever dies."""
         found: list[Flags | None] = [None, None]
         structure = self._view.structure
         sizes = len(structure.face_nodes), len(structure.cell_nodes)
@@ -240,8 +276,6 @@ class _Transfer:
                 if whole is None:
                     whole = found[k] = np.ones((len(self._own), sizes[k]), bool)
                 whole[first:last] = flags
-        if not self._aligned:
-            found = [None if f is None else flags_at(f, self._own, self._time) for f in found]
         return found[0], found[1]
 
     # Fields
@@ -334,6 +368,13 @@ class _Turn:
                     self._file.seek((state * self._shape[1] + part.start) * self._entry)
                     self._file.readinto(out[state].data.cast("B"))  # type: ignore[attr-defined]
         return out
+
+
+def _longest(vectors: Block) -> tuple[int, float]:
+    """Place and length of the longest of some vectors (node, 3)."""
+    squared = np.einsum("ij,ij->i", vectors, vectors, dtype=np.float64)
+    node = int(squared.argmax())
+    return node, float(np.sqrt(squared[node]))
 
 
 def _columns(flags: Flags, part: slice) -> Block:

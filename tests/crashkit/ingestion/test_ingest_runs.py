@@ -463,3 +463,25 @@ def test_reader_at_fault_costs_its_run_only(place: Place, answer: object, told: 
     with pytest.raises(ReadError, match=told):
         place.try_ingest(MemoryRun("good"), Faulty(answer))
     assert place.ingest(MemoryRun("good"), Faulty(answer), on_error="skip")["sim"].values.tolist() == ["good"]
+
+
+def test_two_runs_of_one_row_and_units_nobody_knows_are_refused(place: Place) -> None:
+    table = place.folder / "p.csv"
+    table.write_text("run,speed [km/h]\n1,36\n")
+    with pytest.raises(DataError, match="row 1 could be that of run a_1 and of run b_1; name the rows as the runs"):
+        place.ingest(MemoryRun("a_1"), MemoryRun("b_1"), params=table)
+    table.write_text("run,speed [m/ss]\n1,36\n")
+    with pytest.raises(DataError, match=r"parameter speed: unit 'm/ss' is not known; write one such as m/s, km/h"):
+        place.ingest(MemoryRun("1"), params=table)
+
+
+def test_units_of_a_table_become_si_and_a_negative_speed_is_said(place: Place) -> None:
+    table = place.folder / "p.csv"
+    table.write_text("run,speed [ft/s],pressure [psi],pulse [m/s^2]\n1,-10,1000,2\n")
+    summary = place.try_ingest(MemoryRun("run_001"), params=table)
+    assert any("speed is negative in the row of run run_001" in n for n in summary.notes)
+    assert any("run run_001 has row 1" in n for n in summary.notes)
+    with open_dataset(summary.output, chunks=None) as dataset:
+        assert float(dataset["speed"][0]) == pytest.approx(-3.048)
+        assert float(dataset["pressure"][0]) == pytest.approx(6894757.293)
+        assert [dataset[n].attrs["units"] for n in ("speed", "pressure", "pulse")] == ["m s-1", "Pa", "m s-2"]

@@ -96,3 +96,115 @@ def test_missing_table_and_broken_units(tmp_path: Path) -> None:
     (tmp_path / "runs.yaml").write_text("- angle\n")
     with pytest.raises(ReadError, match="expected lines such as impact_speed: m/s"):
         read_parameter_table(tmp_path / "runs.csv")
+
+
+SPEEDS = {"001": {"speed": (50.5, "km/h"), "t": (1.0, "mm")}, "002": {"speed": (51.5, "km/h"), "t": (1.5, "mm")}}
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "run;speed [km/h];t [mm]\r\n001;50,5;1,0\r\n002;51,5;1,5\r\n".encode("utf-8-sig"),
+        "run;speed [km/h];t [mm]\n001;50,5;1,0\n002;51,5;1,5\n".encode("utf-16"),
+        b"sep=;\nrun;speed [km/h];t [mm]\n001;50,5;1,0\n002;51,5;1,5\n",
+        b"run\tspeed [km/h]\tt [mm]\n001\t50,5\t1,0\n002\t51,5\t1,5\n",
+        b"run,speed [km/h],t [mm],\n001,50.5,1,\n002,51.5,1.5,\n",
+        b"# a comment\nrun,speed (km/h),t in mm\n001,50.5,1\n002,51.5,1.5\n",
+        b"Front crash,,\n,,\nrun,speed,t\n,km/h,mm\n001,50.5,1\n002,51.5,1.5\n",
+        b"run,speed,t\nunit,[km/h],[mm]\n001,50.5,1\n002,51.5,1.5\n",
+        b"name,run,speed [km/h],t [mm]\nfast,001,50.5,1\nfaster,002,51.5,1.5\n",
+    ],
+    ids=["german", "utf-16", "sep", "tabs", "trailing comma", "comment", "title and units row", "units row", "name and run"],
+)  # fmt: skip
+def test_what_spreadsheets_leave_is_read(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "runs.csv").write_bytes(content)
+    assert read_parameter_table(tmp_path / "runs.csv").rows == SPEEDS
+
+
+def test_the_code_page_of_windows_and_letters_of_other_languages(tmp_path: Path) -> None:
+    (tmp_path / "runs.csv").write_bytes("run;Tür [°]\n1;0,5\n".encode("cp1252"))
+    assert read_parameter_table(tmp_path / "runs.csv").rows == {"1": {"Tür": (0.5, "°")}}
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("350,000,000", 3.5e8),
+        ("1,000.5", 1000.5),
+        ("1.000,5", 1000.5),
+        ("350 000", 3.5e5),
+        ("0,5", 0.5),
+        ("-12,25", -12.25),
+        ("1,5e-3", 0.0015),
+        ("2.5E3", 2500.0),
+    ],
+)
+def test_numbers_of_one_meaning_are_read(tmp_path: Path, text: str, expected: float) -> None:
+    (tmp_path / "runs.csv").write_text(f'run;a\nx;"{text}"\n')
+    assert read_parameter_table(tmp_path / "runs.csv").rows["x"]["a"][0] == expected
+
+
+def test_titles_units_and_merged_cells_of_a_workbook(tmp_path: Path) -> None:
+    lines = [
+        ["Front crash", None, None],
+        ["run", "speed", "t"],
+        [None, "km/h", "mm"],
+        ["001", 50.5, 1],
+        ["002", 51.5, 1.5],
+    ]
+    pd.DataFrame(lines).to_excel(tmp_path / "runs.xlsx", index=False, header=False)
+    assert read_parameter_table(tmp_path / "runs.xlsx").rows == SPEEDS
+
+
+@pytest.mark.parametrize(
+    ("header", "names"),
+    [
+        ("t (front),t (rear)", {"t_front": "", "t_rear": ""}),
+        ("t [front],t [rear]", {"t_front": "", "t_rear": ""}),
+        ("t (mm),t (min)", {"t": "mm", "t_min": ""}),
+        ("speed [m/ss],E [N/mm²]", {"speed": "m/ss", "E": "N/mm²"}),
+        ("a (rail) [mm],b", {"a_rail": "mm", "b": ""}),
+    ],
+)
+def test_brackets_hold_a_unit_or_belong_to_the_name(tmp_path: Path, header: str, names: dict[str, str]) -> None:
+    (tmp_path / "runs.csv").write_text(f"run,{header}\nx,1,2\n", encoding="utf-8")
+    row = read_parameter_table(tmp_path / "runs.csv").rows["x"]
+    assert {name: unit for name, (_, unit) in row.items()} == names
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ("run,speed [m/s],speed [km/h]\nx,1,2\n", r"columns 'speed \[m/s\]' and 'speed \[km/h\]' would both be parameter"),
+        ("run,a b,a_b\nx,1,2\n", "columns 'a b' and 'a_b' would both be parameter a_b; rename one"),
+        ("run,a\nx,\"350,000\"\n", "'350,000' may be 350000 or 350.000; write it without the comma"),
+        ("run;a;b\nx;1,5;\"350,000,000\"\n", r"decimal mark in row 2 \(1,5\) and stands between thousands in row 2"),
+        ("run,a,\nx,1,2\n", "column 3 has values and no name"),
+        ("run,...\nx,1\n", "'...' is no name of a parameter"),
+        ("run,a\nx,1_000\n", "found '1_000', expected a number"),
+        ("run,a\nx,\0\n", "holds bytes that are no text"),
+    ],
+)  # fmt: skip
+def test_what_has_two_meanings_is_refused_with_the_cure(tmp_path: Path, content: str, told: str) -> None:
+    (tmp_path / "runs.csv").write_text(content)
+    with pytest.raises(ReadError, match=told):
+        read_parameter_table(tmp_path / "runs.csv")
+
+
+def test_runs_find_their_rows_by_number_where_that_is_unique(tmp_path: Path) -> None:
+    (tmp_path / "runs.json").write_text('[{"run": 1, "a": 10}, {"run": 2, "a": 11}]')
+    table = read_parameter_table(tmp_path / "runs.json")
+    assert [table.row(run)["a"][0] for run in ("001", "1", "run_002")] == [10, 10, 11]
+    with pytest.raises(DataError, match="has no row for run 003"):
+        table.row("003")
+    (tmp_path / "runs.csv").write_text("run,a\n01,1\n1,2\n")
+    twice = read_parameter_table(tmp_path / "runs.csv")
+    assert twice.row("1")["a"][0] == 2
+    with pytest.raises(DataError, match="rows 01 and 1 could both be that of run 001"):
+        twice.row("001")
+
+
+def test_one_key_twice_in_json_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "runs.json").write_text('{"x": {"a": 1}, "x": {"a": 2}}')
+    with pytest.raises(ReadError, match="'x' stands there twice"):
+        read_parameter_table(tmp_path / "runs.json")
