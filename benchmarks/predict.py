@@ -42,7 +42,7 @@ from crashkit.mesh.hierarchy import build_hierarchy
 from surrogates.data.campaign import Campaign
 from surrogates.data.graphs import Graphs
 from surrogates.data.inputs import InputScaling, Ranges
-from surrogates.data.samples import Split
+from surrogates.data.samples import ValidationSplit
 from surrogates.models.cascade import Cascade, build_level
 from surrogates.models.level import LevelNetwork
 from surrogates.record import Record
@@ -97,7 +97,7 @@ def untrained(chosen: Settings, graphs: Graphs) -> Surrogate:
             level.process = random_process(level.latent)
         cascade.add(number, level)
     campaign = Campaign(PARAMETERS, ranges.names, ranges.units, TIME, lambda _: np.empty(0), graphs.n_full)
-    record = Record.of(campaign, chosen, ranges, Split(np.array([0, 1]), np.array([], int)))
+    record = Record.of(campaign, chosen, ranges, ValidationSplit(np.array([0, 1]), np.array([], int)))
     return Surrogate(chosen, record, graphs, cascade)
 
 

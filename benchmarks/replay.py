@@ -30,7 +30,7 @@ from surrogates.data.campaign import Campaign
 from surrogates.design.criteria import ExpectedReduction
 from surrogates.settings import settings
 from surrogates.surrogate import Surrogate
-from surrogates.training.train import train
+from surrogates.training.train import train_surrogate
 
 
 def main() -> None:
@@ -110,13 +110,13 @@ class Replay:
                 return out
             chosen += self.ask(surrogate, chosen, pool)
 
-    def train(self, runs: list[int]) -> Surrogate:
+    def train_surrogate(self, runs: list[int]) -> Surrogate:
         some = replace(
             self.whole, parameters=self.whole.parameters[runs], runs=tuple(self.whole.runs[k] for k in runs),
             displacement=lambda level: self.memory[runs],
         )  # fmt: skip
         told = [f"physics.odd=[{', '.join(self.odd)}]"] if self.odd else []
-        return train(some, settings("pod-gpr", overrides=told))
+        return train_surrogate(some, settings("pod-gpr", overrides=told))
 
     def ask(self, surrogate: Surrogate, chosen: list[int], pool: list[int]) -> list[int]:
         known = Known.of(surrogate, self.box)

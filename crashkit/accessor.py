@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from crashkit.errors import DataError
-from crashkit.selection import Selection, runs_of
+from crashkit.selection import WhichRuns, runs_of
 
 if TYPE_CHECKING:
     import pyvista
@@ -33,7 +33,7 @@ class CrashAccessor:
 
         return parameters(self._dataset)
 
-    def split(self, test: Selection, *, seed: int = 0) -> tuple[xr.Dataset, xr.Dataset]:
+    def split(self, test: WhichRuns, *, seed: int = 0) -> tuple[xr.Dataset, xr.Dataset]:
         """(training runs, test runs), each in the dataset's order; `test` as in `runs_of`.
 
         Raises

@@ -64,7 +64,7 @@ def open_dataset(path: str | Path, *, chunks: Literal["stored"] | Mapping[str, i
             f"{path}: holds no variable {', '.join(missing)}; expected a dataset made by crashkit ingest"
             + ("; it is damaged" if "displacement" in dataset.variables else "")
         )
-    with reading(path):
+    with reading_dataset(path):
         lost = lost_chunks(path, [str(name) for name in dataset["sim"].values]) if is_folder else []
         if lost:
             dataset.close()
@@ -77,7 +77,7 @@ def open_dataset(path: str | Path, *, chunks: Literal["stored"] | Mapping[str, i
 
 
 @contextlib.contextmanager
-def reading(path: str | Path) -> Iterator[None]:
+def reading_dataset(path: str | Path) -> Iterator[None]:
     """Values read lazily from a damaged dataset raise ReadError within this context, and not what libraries raise."""
     try:
         yield
@@ -117,7 +117,7 @@ def dataset_checksum(dataset: str | Path | xr.Dataset) -> str:
     Ingest keeps the same number in the attribute `checksum`.
     """
     if not isinstance(dataset, xr.Dataset):
-        with open_dataset(dataset, chunks=None) as opened, reading(dataset):
+        with open_dataset(dataset, chunks=None) as opened, reading_dataset(dataset):
             return dataset_checksum(opened)
     runs = range(dataset.sizes["sim"])
     return _checksum_from(dataset, [run_checksum(digests_of_run(dataset, k)) for k in runs])

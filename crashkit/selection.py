@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     pass
 
 
-Selection = int | float | slice | str | Sequence[int | str]
+WhichRuns = int | float | slice | str | Sequence[int | str]
 
 
-def runs_of(names: Sequence[str], chosen: Selection, *, seed: int = 0) -> list[int]:
+def runs_of(names: Sequence[str], chosen: WhichRuns, *, seed: int = 0) -> list[int]:
     """Which of the runs `names` a selection means, as increasing numbers.
 
     An int or a fraction below 1 draws that many at random (seeded); a slice or "27:36" means places; a list or
@@ -58,7 +58,7 @@ def runs_of(names: Sequence[str], chosen: Selection, *, seed: int = 0) -> list[i
     return out
 
 
-def _parse(text: str) -> Selection:
+def _parse(text: str) -> WhichRuns:
     text = text.strip()
     if ":" in text and "," not in text:
         try:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from surrogates.data.campaign import Campaign
 from surrogates.data.inputs import Ranges
-from surrogates.data.samples import Split
+from surrogates.data.samples import ValidationSplit
 from surrogates.settings import Settings
 
 HISTORY = (
@@ -77,7 +77,7 @@ class Record:
     notes: list[str] = field(default_factory=list)
 
     @classmethod
-    def of(cls, campaign: Campaign, settings: Settings, ranges: Ranges, split: Split) -> Record:
+    def of(cls, campaign: Campaign, settings: Settings, ranges: Ranges, split: ValidationSplit) -> Record:
         names = campaign.runs or tuple(str(k) for k in range(len(campaign.parameters)))
         return cls(
             ranges=ranges,

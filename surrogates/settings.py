@@ -17,9 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from surrogates.errors import SurrogateError
 
-Model = Literal["mh", "podnn", "aenn", "gaenn", "pod-gpr", "pod-rbf"]
+ModelName = Literal["mh", "podnn", "aenn", "gaenn", "pod-gpr", "pod-rbf"]
 Preset = Literal["fast", "paper"]
-MODELS: tuple[Model, ...] = ("mh", "podnn", "aenn", "gaenn", "pod-gpr", "pod-rbf")
+MODELS: tuple[ModelName, ...] = ("mh", "podnn", "aenn", "gaenn", "pod-gpr", "pod-rbf")
 PRESETS: tuple[Preset, ...] = ("fast", "paper")
 
 # Names of reductions; `surrogates.reductions.reduction.register` adds to them.
@@ -292,7 +292,7 @@ class Settings(_Frozen):
         elements erode, else refuse.
     """
 
-    model: Model = "mh"
+    model: ModelName = "mh"
     preset: Preset = "fast"
     seed: Annotated[int, Field(ge=0)] = 0
     levels: tuple[Annotated[int, Field(ge=0)], ...] = ()

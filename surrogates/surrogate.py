@@ -169,14 +169,14 @@ class Surrogate:
         kept = self.record.fits.get(self.number(level))
         return {} if kept is None else {k: np.asarray(v, np.float64) for k, v in kept.history.items() if v}
 
-    def fit(self, level: int | None = None) -> Fit | None:
+    def training(self, level: int | None = None) -> Fit | None:
         """The training behind `level`: its own, or that of all levels where they were trained together."""
         number = self.number(level)
         return self.record.fits.get(min(self.core.numbers) if self.settings.unified else number)
 
     def seconds_per_epoch(self, level: int | None = None) -> float:
         """As measured in training; NaN for models without epochs."""
-        kept = self.fit(level)
+        kept = self.training(level)
         return float("nan") if kept is None else kept.seconds_per_epoch
 
     def training_seconds(self, level: int | None = None) -> float:

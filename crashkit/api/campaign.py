@@ -23,9 +23,9 @@ class RunField:
         self.shape = (len(self._runs), states, nodes, 3)
 
     def __getitem__(self, run: int) -> NDArray[np.float32]:
-        from crashkit.dataset import open_dataset, reading
+        from crashkit.dataset import open_dataset, reading_dataset
 
-        with open_dataset(self._path, chunks=None) as dataset, reading(self._path):
+        with open_dataset(self._path, chunks=None) as dataset, reading_dataset(self._path):
             return dataset["displacement"].isel(sim=self._runs[run]).values
 
 
@@ -40,7 +40,7 @@ def open_campaign(path: str | Path, test: Any = None, *, symmetry: bool = False)
     """
     import numpy as np
 
-    from crashkit.dataset import open_dataset, reading
+    from crashkit.dataset import open_dataset, reading_dataset
     from crashkit.errors import DataError
     from crashkit.mesh.store import has_hierarchy, level_displacement, read_hierarchy
     from crashkit.selection import runs_of
@@ -49,7 +49,7 @@ def open_campaign(path: str | Path, test: Any = None, *, symmetry: bool = False)
     from surrogates.data.campaign import Campaign
 
     path = Path(path)
-    with open_dataset(path) as opened, reading(path):
+    with open_dataset(path) as opened, reading_dataset(path):
         erodes = "alive" in opened or "cell_alive" in opened
         unread = [n for n in ("displacement", "alive", "cell_alive", "history") if n in opened]
         dataset = opened.drop_vars([*unread, *fields(opened)]).load()

@@ -194,13 +194,13 @@ def _reader(path: str, dataset: xr.Dataset) -> Callable[[int], NDArray[np.float3
     """Reads one run (state, node, 3), m; raises ReadError where it is damaged."""
     import numpy as np
 
-    from crashkit.dataset import reading
+    from crashkit.dataset import reading_dataset
     from crashkit.errors import ReadError
 
     erodes = "alive" in dataset or "cell_alive" in dataset
 
     def read(run: int) -> NDArray[np.float32]:
-        with reading(path):
+        with reading_dataset(path):
             u = np.asarray(dataset["displacement"].isel(sim=run).values)
         if not erodes and not np.isfinite(u).all():
             raise ReadError(

@@ -35,12 +35,12 @@ def export_run(dataset: str | Path | xr.Dataset, run: str | int, output: str | P
     OutputError
         If `output` cannot be written.
     """
-    from crashkit.dataset import open_dataset, reading
+    from crashkit.dataset import open_dataset, reading_dataset
     from crashkit.selection import runs_of
     from crashkit.writers.run import write_run
 
     if isinstance(dataset, (str, Path)):
-        with open_dataset(dataset, chunks=None) as opened, reading(dataset):
+        with open_dataset(dataset, chunks=None) as opened, reading_dataset(dataset):
             return export_run(opened, run, output)
     names = [str(name) for name in dataset["sim"].values]
     place = runs_of(names, [run])[0]

@@ -59,7 +59,7 @@ def train(
     from surrogates.storage.folder import save
     from surrogates.training.checkpoints import Checkpoints
     from surrogates.training.loop import Diverged
-    from surrogates.training.train import train as fit
+    from surrogates.training.train import train_surrogate
 
     output = Path(output)
     chosen = settings(model, preset, config, overrides)
@@ -80,7 +80,7 @@ def train(
                 report(epoch)
 
         try:
-            surrogate = fit(campaign, chosen, device=device, report=tell, keeper=keeper)
+            surrogate = train_surrogate(campaign, chosen, device=device, report=tell, keeper=keeper)
         except SurrogateError as error:
             if first and isinstance(error, Diverged) and error.surrogate is not None:
                 save(error.surrogate, output, overwrite=overwrite)

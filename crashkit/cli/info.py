@@ -55,12 +55,12 @@ def command(
 
 def _dataset(path: Path, report: Path | None, overwrite: bool, quiet: bool) -> dict[str, Any]:
     from crashkit.api.describe import describe_dataset
-    from crashkit.dataset import open_dataset, reading
+    from crashkit.dataset import open_dataset, reading_dataset
 
     with (
         Progress(f"reading {path}", quiet=quiet) as shown,
         open_dataset(path, chunks=None) as dataset,
-        reading(path),
+        reading_dataset(path),
     ):
         found = describe_dataset(dataset, path)
         if report is not None:

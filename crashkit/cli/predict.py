@@ -129,11 +129,11 @@ def _wanted(
         for row, values in read_parameter_table(params).rows.items():
             yield row, {n: f"{v!r}{unit}" for n, (v, unit) in values.items() if n in names}, targets[row], None
     elif dataset is not None:
-        from crashkit.dataset import open_dataset, reading
+        from crashkit.dataset import open_dataset, reading_dataset
         from crashkit.errors import DataError
         from crashkit.selection import runs_of
 
-        with open_dataset(dataset, chunks=None) as opened, reading(dataset):
+        with open_dataset(dataset, chunks=None) as opened, reading_dataset(dataset):
             runs = [str(n) for n in opened["sim"].values]
             true = opened.isel(sim=runs_of(runs, [run])[0])
             missing = [n for n in names if n not in true]

@@ -114,7 +114,7 @@ def _levels(surrogate: Surrogate) -> list[dict[str, object]]:
             "validation_error_m": surrogate.record.errors.get(name),
         }
         for name, number in surrogate.level_names.items()
-        if (fit := surrogate.fit(number)) is not None
+        if (fit := surrogate.training(number)) is not None
     ]
 
 

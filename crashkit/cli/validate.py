@@ -21,13 +21,13 @@ def command(
     """Check a dataset against the schema and its checksums; list what is wrong and exit with 1 if anything is."""
     from dataclasses import asdict
 
-    from crashkit.dataset import open_dataset, reading
+    from crashkit.dataset import open_dataset, reading_dataset
     from data_schema import validate
 
     with (
         Progress(f"checking {path}", quiet=as_json),
         open_dataset(path, chunks=None) as dataset,
-        reading(path),
+        reading_dataset(path),
     ):
         violations = validate(dataset, values=not quick)
     if as_json:

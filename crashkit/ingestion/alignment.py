@@ -110,14 +110,14 @@ def interpolation_error(values: NDArray, own: NDArray[np.float64], common: NDArr
     moves in between at its last speed is counted.
     """
     late = common[(common > own[-1] * (1 + _SAME)) & (common <= reach(own))]
-    held = 0.0
+    late_move = 0.0
     if len(late) and len(own) > 1:
         moved = np.sqrt(((values[-1] - values[-2]).astype(np.float64) ** 2).sum(axis=-1))
-        held = float(np.nan_to_num(moved).max(initial=0.0) * (late[-1] - own[-1]) / (own[-1] - own[-2]))
+        late_move = float(np.nan_to_num(moved).max(initial=0.0) * (late[-1] - own[-1]) / (own[-1] - own[-2]))
     left, fraction = _places(own, common)
     weight = 4 * fraction * (1 - fraction)
     if not weight.any():
-        return held
+        return late_move
     needed = set(left[weight > 0]) | set(left[weight > 0] + 1)
     miss = np.zeros(len(own))
     for k in sorted(needed & set(range(1, len(own) - 1))):
@@ -127,7 +127,7 @@ def interpolation_error(values: NDArray, own: NDArray[np.float64], common: NDArr
         predicted = _hermite(values[near], own[near], place, (own[k] - own[k - 1]) / h)
         apart = np.sqrt(((predicted - values[k]).astype(np.float64) ** 2).sum(axis=-1))
         miss[k] = np.nan_to_num(apart).max(initial=0.0)
-    return max(held, float((weight * np.maximum(miss[left], miss[np.minimum(left + 1, len(own) - 1)])).max()))
+    return max(late_move, float((weight * np.maximum(miss[left], miss[np.minimum(left + 1, len(own) - 1)])).max()))
 
 
 def flags_at(flags: NDArray[np.bool_], own: NDArray[np.float64], common: NDArray[np.float64]) -> NDArray[np.bool_]:

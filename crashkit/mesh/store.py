@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from crashkit.chunks import KEYS, codecs
-from crashkit.dataset import open_dataset, reading
+from crashkit.dataset import open_dataset, reading_dataset
 from crashkit.errors import DataError, OutputError, ReadError
 from crashkit.mesh.levels import Hierarchy
 from crashkit.mesh.lifting import LiftingError, LiftingMeter
@@ -222,7 +222,7 @@ def _open_group(path: Path, name: str) -> Iterator[xr.Dataset]:
             group = open_netcdf(path, name)
     except (OSError, KeyError, ValueError) as error:  # what a missing group raises depends on the library below
         raise DataError(f"{path}: has no group /{name}; run crashkit coarsen {path} again") from error
-    with group, reading(path):
+    with group, reading_dataset(path):
         yield group
 
 
@@ -266,7 +266,7 @@ def _stream(
     )  # fmt: skip
     for run in range(runs):
         for begin, end in split_states(states, hierarchy.n_nodes, _BUDGET):
-            with reading(path):
+            with reading_dataset(path):
                 block = dataset["displacement"].isel(sim=run, time=slice(begin, end)).values
             meter.add(block)
             write(run, begin, end, block[:, first.kept].astype(np.float32))

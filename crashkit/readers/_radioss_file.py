@@ -185,7 +185,7 @@ class Elements:
 
 
 @dataclass(frozen=True)
-class Layout:
+class FileLayout:
     """Where everything stands in one animation file; equal for all states of a run but for the time."""
 
     time: float = field(compare=False)
@@ -232,7 +232,7 @@ class _Cursor:
         return tuple(bytes(row).split(b"\0")[0].decode("latin-1").strip() for row in raw)
 
 
-def read_layout(content: Content) -> Layout:
+def read_layout(content: Content) -> FileLayout:
     """Walk through a whole file. Raises ReadError at the first place that cannot be."""
     cursor = _Cursor(content)
     if content.read(0, 4) != MAGIC:
@@ -283,7 +283,7 @@ def read_layout(content: Content) -> Layout:
     content.finish(cursor.offset)
     for kind, elements in kinds.items():
         _check_parts(content.file, kind, elements)
-    return Layout(time, (*flags, *counts), position, node_numbers, node_values, kinds, cursor.offset)
+    return FileLayout(time, (*flags, *counts), position, node_numbers, node_values, kinds, cursor.offset)
 
 
 def _read_elements(cursor: _Cursor, flags: tuple[int, ...], what: str, corners: int, components: int) -> Elements:

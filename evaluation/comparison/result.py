@@ -20,7 +20,7 @@ from evaluation.comparison.split import Entry, Split, entries
 from evaluation.comparison.timing import Timing, time_predictions
 from evaluation.errors import EvaluationError
 from evaluation.measures.distance import masked_mean
-from evaluation.measures.projection import held, moving
+from evaluation.measures.projection import last_seen, moving
 from evaluation.measures.regions import by_grid, by_part
 from evaluation.measures.tally import Groups
 
@@ -150,7 +150,7 @@ def decompose(
     for run in runs:
         truth = reference.displacement(run)
         for level, stream in streams.items():
-            stream.add(held(truth if level == 0 else truth[:, reference.level(level).kept]))
+            stream.add(last_seen(truth if level == 0 else truth[:, reference.level(level).kept]))
         if done:
             done(run)
     return {level: moving(stream.result()) for level, stream in streams.items()}

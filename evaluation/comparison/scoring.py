@@ -19,7 +19,7 @@ from evaluation.comparison.reference import Reference
 from evaluation.comparison.sensors import Parted, Sensors, Watched, joined, part_error, watch
 from evaluation.errors import EvaluationError
 from evaluation.measures.distance import Peak, lift, masked_mean, mean_node_error, node_distance
-from evaluation.measures.projection import held, projection_error
+from evaluation.measures.projection import last_seen, projection_error
 from evaluation.measures.tally import Groups, Tally, state_blocks
 
 Key = tuple[int, int]  # number of the model, number of its predictor
@@ -174,7 +174,7 @@ def _score(
 ) -> RunScore:
     mesh = mesh_of(reference, predictor)
     # A reduction is asked about whole states; what is gone there stays where it was.
-    own = held(truth) if mesh is None else held(truth[:, mesh.kept])
+    own = last_seen(truth) if mesh is None else last_seen(truth[:, mesh.kept])
     asked, again = Tally(groups, reference.n_nodes), Tally({_LEVELS: groups[_LEVELS]}, reference.n_nodes)
     parted, watched, within = [], [], []
     for states in state_blocks(*truth.shape[:2]):
@@ -234,7 +234,7 @@ def _lifting(reference: Reference, truth: NDArray[np.float32]) -> dict[int, NDAr
     """Level -> (state,) error of lifting the truth itself from it, m."""
     out = {}
     for level in reference.levels:
-        kept = held(truth[:, level.kept])
+        kept = last_seen(truth[:, level.kept])
         blocks = state_blocks(*truth.shape[:2])
         out[level.index] = np.concatenate(
             [mean_node_error(node_distance(truth[s], lift(kept[s], level.to_full))) for s in blocks]

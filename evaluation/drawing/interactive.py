@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from evaluation.drawing.pictures import DISPLACEMENT, ERROR
 from evaluation.drawing.rendering import choose_view, off_screen
 from evaluation.errors import EvaluationError
+from evaluation.measures.projection import last_seen
 
 MAX_NODES = 10_000
 MAX_STATES = 31
@@ -83,7 +84,7 @@ def interactive_view(
     x, corners, u, p, living = _thinned(x, corners, u, p, living, max_nodes)
     there = np.asarray(np.isfinite(u).all(axis=-1))
     corners, living = _triangles(corners, living & (there[:, corners] | (corners < 0)).all(axis=-1))
-    both = np.concatenate([x[None], x + _held(u), x[None], x + _held(p)])
+    both = np.concatenate([x[None], x + last_seen(u), x[None], x + last_seen(p)])
     origin = both.min(axis=(0, 1))
     step = np.maximum(both.max(axis=(0, 1)) - origin, 1e-9) / _STEPS
     steps = np.round((both - origin) / step).astype(np.uint16)
@@ -130,15 +131,6 @@ def _errors(truth: NDArray[np.float64], prediction: NDArray[np.float64], thinned
 def _limit(*fields: NDArray[np.float64]) -> float:
     """The largest length in cm, for a colour bar from zero."""
     return max(1e-9, max(float(np.nanmax(100 * np.linalg.norm(f, axis=-1), initial=0.0)) for f in fields))
-
-
-def _held(displacement: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Displacements (t, n, 3) in which a node that is gone stays where it was last; its faces are hidden."""
-    held = displacement.copy()
-    for k in range(len(held)):
-        before = held[k - 1] if k else np.zeros_like(held[0])
-        held[k] = np.where(np.isfinite(held[k]), held[k], before)
-    return held
 
 
 def _thinned(

@@ -11,7 +11,7 @@ from evaluation.measures.distance import gone, mean_node_error
 from evaluation.measures.tally import state_blocks
 
 
-def held(displacement: NDArray[np.floating]) -> NDArray[np.floating]:
+def last_seen(displacement: NDArray[np.floating]) -> NDArray[np.floating]:
     """`displacement` (state, node, 3) with every node that is gone (NaN) left where it was seen last.
 
     A decomposition needs a number everywhere; a jump to zero would put modes of its own into the data. The nodes
@@ -42,7 +42,7 @@ def projection_error(displacement: NDArray[np.floating], modes: NDArray[np.float
         raise EvaluationError(
             f"the modes have {modes.shape[0] // 3} nodes and the run {displacement.shape[1]}; expected the same"
         )
-    whole, there = held(displacement), ~gone(displacement)
+    whole, there = last_seen(displacement), ~gone(displacement)
     out = np.empty((modes.shape[1], states))
     for block in state_blocks(*displacement.shape[:2]):
         rest = np.array(whole[block], dtype=np.float32).reshape(block.stop - block.start, -1)

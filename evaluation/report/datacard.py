@@ -26,7 +26,7 @@ from evaluation.figures.kind import Drawing, Kind, to_csv
 from evaluation.figures.outliers import Outliers, robust_score
 from evaluation.figures.singular_values import SingularValues
 from evaluation.measures.distance import gone, largest_node_error, mean_node_error, node_distance
-from evaluation.measures.projection import held, moving
+from evaluation.measures.projection import last_seen, moving
 from evaluation.report.page import Page, plain_json, render_page, show_figure, show_table
 from evaluation.report.verdict import Statement
 
@@ -77,7 +77,7 @@ def summarise(reference: Reference, count: int = N_MODES, done: Callable[[int], 
         speeds.append(_fastest(u, reference.time))
         lost.append(float(gone(u[-1:]).mean()))
         samples.append(u[:, nodes])
-        stream.add(held(u))
+        stream.add(last_seen(u))
         if done:
             done(run)
     return Summary(

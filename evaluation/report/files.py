@@ -80,12 +80,12 @@ class _Blocks:
             self.first = first
         return {name: values[state - first] for name, values in self.held.items()}
 
-    def fields(self) -> dict[str, _Field]:
-        return {name: _Field(self, name, (self.states, *v.shape)) for name, v in self.at(0).items()}
+    def fields(self) -> dict[str, _BlockArray]:
+        return {name: _BlockArray(self, name, (self.states, *v.shape)) for name, v in self.at(0).items()}
 
 
 @dataclass(frozen=True)
-class _Field:
+class _BlockArray:
     """One array of `blocks`, indexed by state."""
 
     blocks: _Blocks

@@ -13,7 +13,7 @@ from scipy import sparse
 from data_schema.levels import Level
 
 
-class Field(Protocol):
+class RunByRun(Protocol):
     """Displacements (sim, state, node, 3) float32, m, of which one run at a time is taken; a numpy array is one."""
 
     @property
@@ -79,7 +79,7 @@ class Campaign:
     parameter_names: tuple[str, ...]
     parameter_units: tuple[str, ...]
     time: NDArray[np.float64]
-    displacement: Callable[[int], Field]
+    displacement: Callable[[int], RunByRun]
     n_nodes: int
     levels: tuple[Level, ...] = ()
     full_edges: NDArray[np.int32] | None = None

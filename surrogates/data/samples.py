@@ -19,7 +19,7 @@ FEWEST_TO_SPLIT = 4
 
 
 @dataclass(frozen=True)
-class Split:
+class ValidationSplit:
     """Places of the runs that train and of those that choose the best epoch; `notes` say what was unusual."""
 
     training: NDArray[np.int64]
@@ -65,7 +65,7 @@ def check(campaign: Campaign, settings: Settings, notes: Notes) -> None:
         notes.add("there is one training run; the model repeats it whatever the parameters")
 
 
-def split(campaign: Campaign, settings: Settings, notes: Notes) -> Split:
+def split(campaign: Campaign, settings: Settings, notes: Notes) -> ValidationSplit:
     """Training and validation runs as the settings want them.
 
     A share is drawn at random with the seed: every eighth run of a Halton campaign would lie in one eighth of the
@@ -75,7 +75,7 @@ def split(campaign: Campaign, settings: Settings, notes: Notes) -> Split:
     everything = np.arange(runs)
     wish = settings.validation
     if wish.measure == "paper" and settings.model not in ("pod-gpr", "pod-rbf"):
-        return Split(everything, np.empty(0, np.int64))
+        return ValidationSplit(everything, np.empty(0, np.int64))
     if wish.runs:
         place = {name: k for k, name in enumerate(campaign.runs)}
         unknown = [name for name in wish.runs if name not in place]
@@ -88,21 +88,21 @@ def split(campaign: Campaign, settings: Settings, notes: Notes) -> Split:
             raise SurrogateError("validation.runs names all training runs; leave some to train on")
     elif runs < FEWEST_TO_SPLIT:
         notes.add(f"no run can be held out of {runs}; weights are chosen on the training runs")
-        return Split(everything, np.empty(0, np.int64))
+        return ValidationSplit(everything, np.empty(0, np.int64))
     else:
         count = min(max(1, round(wish.share * runs)), runs - 1)
         chosen = np.sort(np.random.default_rng(settings.seed).permutation(runs)[:count])
-    return Split(np.setdiff1d(everything, chosen), chosen)
+    return ValidationSplit(np.setdiff1d(everything, chosen), chosen)
 
 
-def everything(campaign: Campaign, settings: Settings) -> Split:
+def everything(campaign: Campaign, settings: Settings) -> ValidationSplit:
     """All runs to train on, for models that choose by folds; runs named for validation are left out while they choose."""
     runs = np.arange(len(campaign.parameters))
     named = split(campaign, settings, Notes()).validation if settings.validation.runs else runs[:0]
-    return Split(runs, named)
+    return ValidationSplit(runs, named)
 
 
-class Runs:
+class LevelRuns:
     """The displacements of one level, or of some of its `nodes`, run by run: checked, and never all at once unless asked."""
 
     def __init__(

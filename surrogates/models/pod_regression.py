@@ -139,7 +139,7 @@ class PodRegression:
 
 
 @dataclass
-class Choice:
+class PodChoice:
     """What cross-validation said: e2 (m) of each candidate, and the chosen one."""
 
     inputs: Inputs
@@ -156,7 +156,7 @@ class PodFit:
 
     core: PodRegression
     registration: Registration
-    choice: Choice
+    choice: PodChoice
     worth: Worth
     held: Callable[[], Iterator[Held]]
 
@@ -200,7 +200,7 @@ def fit_pod_regression(
         report("number of modes")
         errors = {c: _errors(c, trials, settings, counts) for c in candidates}
         best, count = _best(errors, counts)
-    choice = Choice(best.view, count, _named(errors, counts))
+    choice = PodChoice(best.view, count, _named(errors, counts))
     core = _fitted(best, trials, settings, count)
     return PodFit(core, best.registration, choice, worth, lambda: _held(best, trials, settings, count))
 

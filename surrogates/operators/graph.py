@@ -19,7 +19,7 @@ from torch import Tensor
 from data_schema.edges import adjacency, unique_pairs
 from surrogates.errors import SurrogateError
 
-Kind = Literal["cheb", "gcn", "gcn2"]
+ConvolutionKind = Literal["cheb", "gcn", "gcn2"]
 Form = Literal["auto", "sparse", "dense"]
 
 # Up to this many nodes one small dense product beats the sparse one; measured with `benchmarks/train_step.py --forms`.
@@ -46,7 +46,7 @@ class GraphOperator:
         "sparse", "dense", or "auto": dense up to `DENSE_UP_TO` nodes of the device in use.
     """
 
-    def __init__(self, edges: ArrayLike, n_nodes: int, kind: Kind = "cheb", form: Form = "auto") -> None:
+    def __init__(self, edges: ArrayLike, n_nodes: int, kind: ConvolutionKind = "cheb", form: Form = "auto") -> None:
         if kind not in ("cheb", "gcn", "gcn2"):
             raise SurrogateError(f"convolution {kind!r} is unknown; choose cheb, gcn or gcn2")
         self.n_nodes = int(n_nodes)

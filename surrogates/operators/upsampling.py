@@ -9,7 +9,7 @@ import torch
 from scipy import sparse
 from torch import Tensor, nn
 
-Kind = Literal["static", "sparse", "linear"]
+UpsamplingKind = Literal["static", "sparse", "linear"]
 
 
 class Upsampling(nn.Module):
@@ -24,7 +24,7 @@ class Upsampling(nn.Module):
 
     columns: Tensor
 
-    def __init__(self, matrix: sparse.spmatrix, kind: Kind) -> None:
+    def __init__(self, matrix: sparse.spmatrix, kind: UpsamplingKind) -> None:
         super().__init__()
         csr = sparse.csr_matrix(matrix)
         self.kind = kind

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogates.data.campaign import Campaign
-from surrogates.data.samples import Notes, Runs, Split
+from surrogates.data.samples import LevelRuns, Notes, ValidationSplit
 from surrogates.physics.clock import Clock
 from surrogates.physics.derived import DerivedInputs
 from surrogates.physics.symmetry import Symmetry
@@ -81,7 +81,7 @@ class Registration:
             known=self.clock.known(doubled, campaign.time, self.grid),
         )
 
-    def split(self, split: Split, runs: int) -> Split:
+    def split(self, split: ValidationSplit, runs: int) -> ValidationSplit:
         """Places in the registered campaign: images train with their runs, and never choose."""
         if self.symmetry.is_identity:
             return split
@@ -156,9 +156,9 @@ class _RegisteredField:
     ) -> None:
         self._of, self._campaign = registration, campaign
         mirrors = not registration.symmetry.is_identity
-        self._own = Runs(campaign, level, settings, notes)
+        self._own = LevelRuns(campaign, level, settings, notes)
         # An image is put together from the full mesh: mirrored nodes of a level lie between nodes the level lacks.
-        self._full = Runs(campaign, 0, settings, notes) if mirrors and level else self._own
+        self._full = LevelRuns(campaign, 0, settings, notes) if mirrors and level else self._own
         self._nodes = campaign.levels[level - 1].kept if level else None
         count = len(campaign.parameters)
         self.shape = (count * (1 + mirrors), len(registration.grid), self._own.nodes, 3)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from data_schema.pod import pod
 from surrogates.data.campaign import Campaign, Mirror
 from surrogates.data.inputs import over_range
-from surrogates.data.samples import Notes, Runs
+from surrogates.data.samples import LevelRuns, Notes
 from surrogates.errors import SurrogateError
 from surrogates.physics.registration import Registration
 from surrogates.physics.symmetry import mirrored
@@ -92,7 +92,13 @@ class Courses:
 
     @classmethod
     def of(
-        cls, campaign: Campaign, runs: Runs, chosen: NDArray[np.int64], mirrors: Sequence[Mirror], modes: int, seed: int
+        cls,
+        campaign: Campaign,
+        runs: LevelRuns,
+        chosen: NDArray[np.int64],
+        mirrors: Sequence[Mirror],
+        modes: int,
+        seed: int,
     ) -> Courses:
         """The runs `chosen`, read twice: once for the basis, once for the coefficients."""
         length = 3 * runs.nodes
@@ -261,7 +267,7 @@ def course_machine(
 
 def courses_of(campaign: Campaign, settings: Settings, chosen: NDArray[np.int64], notes: Notes) -> Courses:
     """The runs `chosen` of the full mesh with the images of all planes."""
-    runs = Runs(campaign, 0, settings, notes)
+    runs = LevelRuns(campaign, 0, settings, notes)
     modes = max(MODES, max(settings.pod.modes, default=0))
     return Courses.of(campaign, runs, chosen, campaign.mirrors, modes, settings.seed)
 
@@ -272,7 +278,7 @@ def _translations(nodes: int) -> NDArray[np.float32]:
 
 
 def _without_translations(
-    runs: Runs, chosen: NDArray[np.int64], mirrors: Sequence[Mirror], count: int
+    runs: LevelRuns, chosen: NDArray[np.int64], mirrors: Sequence[Mirror], count: int
 ) -> NDArray[np.float32]:
     """(3 * node, mode): POD of runs and images, of what is left without their translation."""
 

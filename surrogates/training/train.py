@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from surrogates.data.campaign import Campaign
 from surrogates.data.graphs import Graphs
 from surrogates.data.inputs import InputScaling, Ranges
-from surrogates.data.samples import Notes, Runs, check, everything, split
+from surrogates.data.samples import LevelRuns, Notes, check, everything, split
 from surrogates.errors import SurrogateError
 from surrogates.models.cascade import Cascade
 from surrogates.models.pod_regression import fit_pod_regression
@@ -28,7 +28,7 @@ from surrogates.uncertainty import FEWEST_RUNS, calibrate
 _LARGEST_RUN = 2 << 30
 
 
-def train(
+def train_surrogate(
     campaign: Campaign,
     settings: Settings,
     *,
@@ -186,19 +186,19 @@ def _note(
             surrogate.bands[number, is_lifted] = calibrate(distances, surrogate.record.time)
 
 
-def _full_field(trainer: Trainer) -> Runs | None:
+def _full_field(trainer: Trainer) -> LevelRuns | None:
     """The full mesh's displacements, of which the validation runs alone are read; None where one run is too large."""
     campaign = trainer.campaign
     if len(campaign.time) * campaign.n_nodes * 12 > _LARGEST_RUN:
         trainer.notes.add("a run of the full mesh is too large to judge lifted predictions while training")
         return None
-    return Runs(campaign, 0, trainer.settings, trainer.notes)
+    return LevelRuns(campaign, 0, trainer.settings, trainer.notes)
 
 
 def node_errors(surrogate: Surrogate, trainer: Trainer, number: int) -> NDArray[np.float64]:
     """Mean distance (node,), m, of prediction and truth over states and validation runs (training runs without any)."""
     held = trainer.split.validation if len(trainer.split.validation) else trainer.split.training
-    runs: Runs = trainer.runs(number, surrogate.graphs)
+    runs: LevelRuns = trainer.runs(number, surrogate.graphs)
     total = np.zeros(surrogate.graphs.n_nodes(number))
     for run in held:
         total += _distance(_predicted(surrogate, trainer.campaign, run, number), runs.read(run)).mean(axis=0)

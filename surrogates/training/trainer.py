@@ -13,7 +13,7 @@ from torch import Tensor
 from surrogates.data.campaign import Campaign
 from surrogates.data.graphs import Graphs
 from surrogates.data.inputs import InputScaling
-from surrogates.data.samples import Notes, Runs, Split, scale_of
+from surrogates.data.samples import LevelRuns, Notes, ValidationSplit, scale_of
 from surrogates.models.cascade import Cascade, build_level
 from surrogates.models.level import LevelNetwork
 from surrogates.models.unified import Unified
@@ -34,7 +34,7 @@ class Trainer:
     campaign: Campaign
     settings: Settings
     graphs: Graphs
-    split: Split
+    split: ValidationSplit
     notes: Notes
     device: torch.device
     report: Callable[[Epoch], None] | None
@@ -75,11 +75,11 @@ class Trainer:
         objective = UnifiedObjective(network, training, validation)
         return self._fit(objective, self.settings.for_level(finest), "MH", seed)
 
-    def runs(self, number: int, graphs: Graphs) -> Runs:
+    def runs(self, number: int, graphs: Graphs) -> LevelRuns:
         """The displacements of level `number` of `graphs`, which may hold fewer nodes than the hierarchy's level."""
         of_hierarchy, wanted = self.graphs.kept(number), graphs.kept(number)
         nodes = None if len(wanted) == len(of_hierarchy) else np.searchsorted(of_hierarchy, wanted)
-        return Runs(self.campaign, number, self.settings, self.notes, nodes)
+        return LevelRuns(self.campaign, number, self.settings, self.notes, nodes)
 
     @property
     def _parts(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -96,7 +96,7 @@ class Trainer:
             report=self.report, keeper=self.keeper,
         )  # fmt: skip
 
-    def _on_states(self, level: LevelNetwork, runs: Runs, inputs: Tensor, held_inputs: Tensor) -> LevelObjective:
+    def _on_states(self, level: LevelNetwork, runs: LevelRuns, inputs: Tensor, held_inputs: Tensor) -> LevelObjective:
         states, held = (runs.samples(part) for part in self._parts)
         level.scale = _divide_by_rms(states, held)
         linear = linear_part(level.reduction)
@@ -107,7 +107,9 @@ class Trainer:
         validation = self._samples(level, held, held_inputs, len(self.split.validation)) if len(held) else None
         return LevelObjective(level, training, validation)
 
-    def _on_coefficients(self, level: LevelNetwork, runs: Runs, inputs: Tensor, held_inputs: Tensor) -> LatentObjective:
+    def _on_coefficients(
+        self, level: LevelNetwork, runs: LevelRuns, inputs: Tensor, held_inputs: Tensor
+    ) -> LatentObjective:
         """POD on fields that stay where they are but for one run; training then sees coefficients alone."""
         squares: list[float] = []
 
@@ -154,7 +156,7 @@ class Trainer:
         return replace(samples, initial=first[:1] if alike else first, run=run)
 
     @torch.no_grad()
-    def _projected(self, level: LevelNetwork, runs: Runs, chosen: NDArray[np.int64]) -> tuple[Tensor, Tensor]:
+    def _projected(self, level: LevelNetwork, runs: LevelRuns, chosen: NDArray[np.int64]) -> tuple[Tensor, Tensor]:
         """Latent vectors (sample, 1, latent) and mean squares (sample,) that the modes leave, in the level's unit."""
         z, rest = [torch.empty(0, level.latent)], [torch.empty(0)]
         for run in chosen:

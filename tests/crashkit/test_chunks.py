@@ -11,7 +11,7 @@ import pytest
 from crashkit.api.campaign import open_campaign
 from crashkit.api.coarsen import coarsen
 from crashkit.api.describe import describe_dataset
-from crashkit.dataset import open_dataset, reading
+from crashkit.dataset import open_dataset, reading_dataset
 from crashkit.errors import ReadError
 from crashkit.mesh.store import level_displacement
 
@@ -25,7 +25,7 @@ def coarsened(demo_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> P
 
 def read_all(path: Path) -> None:
     """Everything that info, coarsen, train and evaluate read."""
-    with open_dataset(path, chunks=None) as dataset, reading(path):
+    with open_dataset(path, chunks=None) as dataset, reading_dataset(path):
         describe_dataset(dataset, path)
     campaign = open_campaign(path)
     for run in range(len(campaign.runs)):

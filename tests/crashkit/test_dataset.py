@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from memory_runs import MemoryRun, RunsInMemory
 
 import crashkit
-from crashkit.dataset import dataset_checksum, demo_data, open_dataset, reading
+from crashkit.dataset import dataset_checksum, demo_data, open_dataset, reading_dataset
 from crashkit.errors import DataError, ReadError
 from crashkit.ingestion.ingest import ingest
 from crashkit.selection import runs_of
@@ -115,7 +115,7 @@ def test_damaged_chunk_is_told_when_it_is_read(demo_dataset: Path, tmp_path: Pat
     with (
         open_dataset(path) as ds,
         pytest.raises(ReadError, match=r"crash.zarr: chunk .* of run run_003 is damaged"),
-        reading(path),
+        reading_dataset(path),
     ):
         ds["displacement"].isel(sim=3).load()
 

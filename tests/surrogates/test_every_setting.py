@@ -23,7 +23,7 @@ from surrogates.physics import trials
 from surrogates.settings import Settings, settings
 from surrogates.storage.folder import load, save
 from surrogates.surrogate import Surrogate
-from surrogates.training.train import train
+from surrogates.training.train import train_surrogate
 
 # A small cascade, and a small regression on modes: what the lines of the table change.
 SMALL = {
@@ -121,7 +121,7 @@ def campaign() -> Campaign:
 
 @functools.cache
 def trained(model: str, overrides: tuple[str, ...]) -> Surrogate:
-    return train(campaign(), settings(model, overrides=(*SMALL[model], *overrides)))
+    return train_surrogate(campaign(), settings(model, overrides=(*SMALL[model], *overrides)))
 
 
 def predicted(surrogate: Surrogate) -> dict[int, np.ndarray]:
@@ -159,7 +159,9 @@ def test_the_table_has_every_setting_and_every_choice() -> None:
 )
 def test_a_setting_trains_changes_what_it_should_and_is_stored(name: str, entry: Line, tmp_path: Path) -> None:
     before = trained(entry.model, entry.given)
-    after = train(campaign(), settings(entry.model, overrides=(*SMALL[entry.model], *entry.given, *entry.change)))
+    after = train_surrogate(
+        campaign(), settings(entry.model, overrides=(*SMALL[entry.model], *entry.given, *entry.change))
+    )
     old, new = predicted(before), predicted(after)
     nodes = {0: 81, 1: 25, 2: 9}
     for level, field in new.items():
@@ -180,7 +182,7 @@ def test_a_setting_trains_changes_what_it_should_and_is_stored(name: str, entry:
 def test_every_model_and_preset_trains_predicts_and_is_stored(model: str, preset: str, tmp_path: Path) -> None:
     overrides = ["level.epochs=1", "level.hidden=[8]", "level.channels=[4]", "pod.modes=[3]", "level.mlp.widths=[8]"]
     overrides += ["levels=[2,1]"] * (model == "mh")
-    after = train(campaign(), settings(model, preset, overrides=overrides))
+    after = train_surrogate(campaign(), settings(model, preset, overrides=overrides))
     new = predicted(after)
     assert new.keys() == ({2, 1} if model == "mh" else {0})
     assert all(np.isfinite(field).all() for field in new.values())
@@ -243,8 +245,8 @@ def eroded() -> Campaign:
 def test_missing_values_are_refused_or_held_as_asked() -> None:
     chosen = settings("mh", overrides=(*SMALL["mh"], "missing=refuse"))
     with pytest.raises(SurrogateError, match="run run_004, state 5, node 0"):
-        train(eroded(), chosen)
-    held = train(eroded(), settings("mh", overrides=(*SMALL["mh"], "missing=hold")))
+        train_surrogate(eroded(), chosen)
+    held = train_surrogate(eroded(), settings("mh", overrides=(*SMALL["mh"], "missing=hold")))
     assert all(np.isfinite(field).all() for field in predicted(held).values())
     assert any("last displacement" in note for note in held.record.notes)
 
@@ -253,7 +255,9 @@ def test_folds_decide_with_how_many_runs_a_left_out_run_is_judged() -> None:
     """With few runs each is a part of its own whatever is asked for."""
     runs = trials._LEAVE_ONE + 2
     few, many = (
-        train(plate.campaign(runs), settings("pod-gpr", overrides=(*SMALL["pod-gpr"], f"validation.folds={n}"))).record
+        train_surrogate(
+            plate.campaign(runs), settings("pod-gpr", overrides=(*SMALL["pod-gpr"], f"validation.folds={n}"))
+        ).record
         for n in (2, runs)
     )
     assert few.left_out.keys() == many.left_out.keys() == set(few.fitted_runs)

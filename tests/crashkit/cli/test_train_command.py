@@ -27,7 +27,7 @@ from data_schema.levels import Level
 from surrogates.settings import settings
 from surrogates.storage.folder import load
 from surrogates.surrogate import Surrogate
-from surrogates.training.train import train
+from surrogates.training.train import train_surrogate
 
 UNITS = {"impact_speed": "m s-1", "impact_angle": "degree", "yield_stress": "Pa"}
 ASKED = {"impact_speed": 20.0, "impact_angle": "5deg", "yield_stress": "400 MPa"}
@@ -123,7 +123,7 @@ def test_what_is_trained_from_disk_is_what_is_trained_from_arrays(crash: Path, m
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # as the command trains small networks: the order of sums decides the last bits
     try:
-        expected = train(campaign, settings("mh", overrides=["level.epochs=2"]))
+        expected = train_surrogate(campaign, settings("mh", overrides=["level.epochs=2"]))
     finally:
         torch.set_num_threads(threads)
     mu = plate.parameters(1, seed=2)[0]

@@ -21,7 +21,7 @@ from surrogates.settings import settings
 from surrogates.storage.browser import browsable
 from surrogates.storage.folder import save
 from surrogates.surrogate import Surrogate
-from surrogates.training.train import train
+from surrogates.training.train import train_surrogate
 
 BROWSER = next((b for b in ("chromium", "chromium-browser", "google-chrome") if shutil.which(b)), None)
 FLAGS = (
@@ -40,7 +40,7 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Su
     """Small models of a plate, as folders and loaded."""
     home, out = tmp_path_factory.mktemp("models"), {}
     for name, told in MODELS.items():
-        surrogate = train(plate.campaign(10), settings("mh" if name == "gcn" else name, overrides=told))
+        surrogate = train_surrogate(plate.campaign(10), settings("mh" if name == "gcn" else name, overrides=told))
         save(surrogate, home / name)
         out[name] = (home / name, surrogate)
     return out
@@ -152,7 +152,7 @@ def test_nothing_is_fetched_from_anywhere(models: dict[str, tuple[Path, Surrogat
 def test_models_of_different_meshes_do_not_share_a_page(
     models: dict[str, tuple[Path, Surrogate]], tmp_path: Path
 ) -> None:
-    other = train(plate.campaign(10), settings("pod-gpr"))
+    other = train_surrogate(plate.campaign(10), settings("pod-gpr"))
     assert other.points is not None
     other.points = other.points[:-1]
     save(other, tmp_path / "other")
@@ -161,7 +161,7 @@ def test_models_of_different_meshes_do_not_share_a_page(
 
 
 def test_what_has_no_form_for_a_browser_is_refused() -> None:
-    surrogate = train(plate.campaign(10), settings("pod-rbf"))
+    surrogate = train_surrogate(plate.campaign(10), settings("pod-rbf"))
     with pytest.raises(SurrogateError, match="have a form for a browser"):
         browsable(surrogate, "rbf", "m0_")
 

@@ -7,7 +7,7 @@ import pytest
 
 from data_schema.pod import StreamedPod, pod
 from evaluation.errors import EvaluationError
-from evaluation.measures.projection import held, moving, projection_error
+from evaluation.measures.projection import last_seen, moving, projection_error
 
 
 def _runs(seed: int, count: int, states: int = 4, nodes: int = 7) -> list[np.ndarray]:
@@ -54,7 +54,7 @@ def test_projecting_leaves_the_run_as_it_was():
 def test_nodes_that_are_gone_stay_where_they_were_last_seen():
     u = np.arange(24, dtype=float).reshape(4, 2, 3)
     u[2:, 1] = np.nan
-    filled = held(u)
+    filled = last_seen(u)
     np.testing.assert_array_equal(filled[2, 1], u[1, 1])
     np.testing.assert_array_equal(filled[3, 1], u[1, 1])
     np.testing.assert_array_equal(filled[:, 0], u[:, 0])

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from surrogates.data.campaign import Campaign
-from surrogates.data.samples import Notes, Runs, check, everything, scale_of, split
+from surrogates.data.samples import LevelRuns, Notes, check, everything, scale_of, split
 from surrogates.errors import SurrogateError
 from surrogates.settings import settings
 
@@ -59,7 +59,7 @@ def test_too_few_runs_are_told() -> None:
 
 
 def test_a_missing_value_is_named_by_run_state_and_node() -> None:
-    runs = Runs(changed((4, 3, 17, 1), np.nan), 0, settings("mh"), Notes())
+    runs = LevelRuns(changed((4, 3, 17, 1), np.nan), 0, settings("mh"), Notes())
     with pytest.raises(SurrogateError, match=r"run run_004, state 3, node 17: .*missing=hold"):
         runs.read(4)
 
@@ -67,7 +67,7 @@ def test_a_missing_value_is_named_by_run_state_and_node() -> None:
 def test_held_nodes_keep_their_last_displacement() -> None:
     campaign = changed((4, slice(3, None), 17), np.nan)
     notes = Notes()
-    run = Runs(campaign, 0, settings("mh", overrides=["missing=hold"]), notes).read(4)
+    run = LevelRuns(campaign, 0, settings("mh", overrides=["missing=hold"]), notes).read(4)
     before = plate.displacement(plate.parameters(6))[4]
     np.testing.assert_array_equal(run[3:, 17], np.broadcast_to(before[2, 17], (4, 3)))
     np.testing.assert_array_equal(run[:3], before[:3])
@@ -76,15 +76,15 @@ def test_held_nodes_keep_their_last_displacement() -> None:
 
 def test_where_elements_erode_nodes_are_held_without_being_asked() -> None:
     campaign = replace(changed((4, slice(3, None), 17), np.nan), erodes=True)
-    run = Runs(campaign, 0, settings("mh"), Notes()).read(4)
+    run = LevelRuns(campaign, 0, settings("mh"), Notes()).read(4)
     before = plate.displacement(plate.parameters(6))[4]
     np.testing.assert_array_equal(run[3:, 17], np.broadcast_to(before[2, 17], (4, 3)))
     with pytest.raises(SurrogateError, match="run run_004, state 3, node 17"):
-        Runs(campaign, 0, settings("mh", overrides=["missing=refuse"]), Notes()).read(4)
+        LevelRuns(campaign, 0, settings("mh", overrides=["missing=refuse"]), Notes()).read(4)
 
 
 def test_infinite_values_are_never_held() -> None:
-    runs = Runs(changed((4, 3, 17), np.inf), 0, settings("mh", overrides=["missing=hold"]), Notes())
+    runs = LevelRuns(changed((4, 3, 17), np.inf), 0, settings("mh", overrides=["missing=hold"]), Notes())
     with pytest.raises(SurrogateError, match="run run_004, state 3, node 17"):
         runs.read(4)
 
@@ -155,7 +155,7 @@ def test_without_names_runs_are_told_by_number() -> None:
     u = plate.displacement(plate.parameters(6))
     u[4, 3, 17] = np.nan
     with pytest.raises(SurrogateError, match="run 4, state 3, node 17"):
-        Runs(replace(plate.campaign(6), runs=(), displacement=lambda level: u), 0, settings("mh"), Notes()).read(4)
+        LevelRuns(replace(plate.campaign(6), runs=(), displacement=lambda level: u), 0, settings("mh"), Notes()).read(4)
 
 
 @pytest.mark.parametrize(
@@ -196,7 +196,7 @@ def test_the_runs_there_are_are_listed_shortly(runs: int, told: str) -> None:
 
 @pytest.mark.parametrize(("level", "nodes"), [(0, 81), (1, 25), (2, 9)])
 def test_a_level_is_read_as_it_is_in_single_precision(level: int, nodes: int) -> None:
-    runs = Runs(plate.campaign(6), level, settings("mh"), Notes())
+    runs = LevelRuns(plate.campaign(6), level, settings("mh"), Notes())
     assert (runs.states, runs.nodes) == (7, nodes)
     found = runs.read(3)
     np.testing.assert_array_equal(found, plate.campaign(6).displacement(level)[3])
@@ -205,20 +205,20 @@ def test_a_level_is_read_as_it_is_in_single_precision(level: int, nodes: int) ->
 
 def test_some_nodes_of_a_level_can_be_read() -> None:
     some = np.array([2, 0, 5])
-    runs = Runs(plate.campaign(6), 2, settings("mh"), Notes(), some)
+    runs = LevelRuns(plate.campaign(6), 2, settings("mh"), Notes(), some)
     assert runs.nodes == 3
     np.testing.assert_array_equal(runs.read(1), plate.campaign(6).displacement(2)[1][:, some])
     assert runs.read(1).flags["C_CONTIGUOUS"]
 
 
 def test_a_value_missing_in_a_node_that_is_not_read_does_no_harm() -> None:
-    runs = Runs(changed((4, 3, 17), np.nan), 0, settings("mh"), Notes(), np.array([16, 18]))
+    runs = LevelRuns(changed((4, 3, 17), np.nan), 0, settings("mh"), Notes(), np.array([16, 18]))
     assert np.isfinite(runs.read(4)).all()
 
 
 def test_samples_are_all_states_run_by_run_directions_before_nodes() -> None:
     campaign = plate.campaign(6)
-    found = Runs(campaign, 2, settings("mh"), Notes()).samples(np.array([4, 1]))
+    found = LevelRuns(campaign, 2, settings("mh"), Notes()).samples(np.array([4, 1]))
     u = campaign.displacement(2)
     assert found.shape == (14, 3, 9)
     assert found.dtype == torch.float32
@@ -231,12 +231,12 @@ def test_samples_are_all_states_run_by_run_directions_before_nodes() -> None:
 def test_displacements_must_have_all_runs_and_states(shape: tuple[int, int]) -> None:
     campaign = plate.campaign(6, displacement=lambda level: np.zeros((*shape, 81, 3), np.float32))
     with pytest.raises(SurrogateError, match="expected 6 runs and 7 states"):
-        Runs(campaign, 0, settings("mh"), Notes())
+        LevelRuns(campaign, 0, settings("mh"), Notes())
 
 
 def test_a_run_that_does_not_move_is_noted() -> None:
     notes = Notes()
-    runs = Runs(changed((4,), 0.0), 0, settings("mh"), notes)
+    runs = LevelRuns(changed((4,), 0.0), 0, settings("mh"), notes)
     runs.read(3)
     assert notes.lines == []
     runs.read(4)
@@ -248,7 +248,7 @@ def test_a_node_held_for_a_while_moves_on_when_it_is_there_again() -> None:
     before = u[4].copy()
     u[4, [2, 3, 5], 17] = np.nan
     u[4, 6, 20, 1] = np.nan  # one component missing is a node missing
-    run = Runs(
+    run = LevelRuns(
         plate.campaign(6, displacement=lambda level: u), 0, settings("mh", overrides=["missing=hold"]), Notes()
     ).read(4)
     np.testing.assert_array_equal(run[:, 17], before[[0, 1, 1, 1, 4, 4, 6], 17])
@@ -258,7 +258,7 @@ def test_a_node_held_for_a_while_moves_on_when_it_is_there_again() -> None:
 
 
 def test_a_node_missing_from_the_start_cannot_be_held() -> None:
-    runs = Runs(changed((4, 0, 17), np.nan), 0, settings("mh", overrides=["missing=hold"]), Notes())
+    runs = LevelRuns(changed((4, 0, 17), np.nan), 0, settings("mh", overrides=["missing=hold"]), Notes())
     with pytest.raises(SurrogateError, match="run run_004, state 0, node 17: has no displacement in the first state"):
         runs.read(4)
 
@@ -275,7 +275,7 @@ def test_nothing_can_be_learnt_where_nothing_moves(mean_square: float) -> None:
 
 def test_displacements_kept_in_double_precision_are_read_in_single() -> None:
     u = plate.displacement(plate.parameters(6)).astype(np.float64)
-    found = Runs(plate.campaign(6, displacement=lambda level: u), 0, settings("mh"), Notes()).read(2)
+    found = LevelRuns(plate.campaign(6, displacement=lambda level: u), 0, settings("mh"), Notes()).read(2)
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, u[2])
 

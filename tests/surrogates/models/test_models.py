@@ -17,13 +17,13 @@ from surrogates.storage.folder import load, save
 from surrogates.surrogate import Surrogate
 from surrogates.training.checkpoints import Checkpoints
 from surrogates.training.loop import Diverged, Epoch
-from surrogates.training.train import train
+from surrogates.training.train import train_surrogate
 
 SHORT = ("level.epochs=4", "transfer.epochs=1", "level.batch=16")
 
 
 def trained(model: str, *overrides: str, runs: int = 10, **more: object) -> Surrogate:
-    return train(plate.campaign(runs), settings(model, overrides=[*SHORT, *overrides]), **more)  # type: ignore[arg-type]
+    return train_surrogate(plate.campaign(runs), settings(model, overrides=[*SHORT, *overrides]), **more)  # type: ignore[arg-type]
 
 
 def e2(surrogate: Surrogate, level: int, mu: np.ndarray) -> float:
@@ -115,15 +115,15 @@ def test_a_killed_training_resumed_gives_the_same_cascade(tmp_path: Path) -> Non
             raise Killed
 
     with pytest.raises(Killed):
-        train(campaign, chosen, report=kill, keeper=Checkpoints(tmp_path / "s", chosen, campaign, every=2))
+        train_surrogate(campaign, chosen, report=kill, keeper=Checkpoints(tmp_path / "s", chosen, campaign, every=2))
     told: list[str] = []
-    resumed = train(
+    resumed = train_surrogate(
         campaign, chosen, report=lambda epoch: told.append(f"{epoch.name} {epoch.epoch}"),
         keeper=Checkpoints(tmp_path / "s", chosen, campaign, every=2, resume=True),
     )  # fmt: skip
     assert told == ["MH1 3", "MH1 4"]
     mu = plate.parameters(2, seed=3)
-    whole = train(campaign, chosen)
+    whole = train_surrogate(campaign, chosen)
     for level in (2, 1):
         np.testing.assert_array_equal(resumed.predict(mu, level=level), whole.predict(mu, level=level))
 
@@ -204,6 +204,6 @@ def test_a_run_that_does_not_move_is_noted_and_learnt() -> None:
     u[2] = 0.0
     coarse = plate.levels()
     campaign = plate.campaign(6, displacement=lambda k: u if k == 0 else u[:, :, coarse[k - 1].kept])
-    surrogate = train(campaign, settings("mh", overrides=SHORT))
+    surrogate = train_surrogate(campaign, settings("mh", overrides=SHORT))
     assert "run run_002 does not move in any state; it is learnt as it is" in surrogate.record.notes
     assert np.isfinite(surrogate.predict(plate.parameters(1)[0])).all()

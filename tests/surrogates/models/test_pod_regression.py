@@ -12,7 +12,7 @@ from surrogates.errors import SurrogateError
 from surrogates.models.pod_regression import PodRegression
 from surrogates.regression.gaussian import RadialBasis
 from surrogates.settings import settings
-from surrogates.training.train import train
+from surrogates.training.train import train_surrogate
 
 
 def e2(a: np.ndarray, b: np.ndarray) -> float:
@@ -29,7 +29,9 @@ def test_radial_basis_functions_are_scipys() -> None:
 @pytest.mark.parametrize("inputs", ["trajectory", "point"])
 @pytest.mark.parametrize("model", ["pod-gpr", "pod-rbf"])
 def test_runs_never_seen_are_predicted(model: str, inputs: str) -> None:
-    surrogate = train(plate.campaign(24), settings(model, overrides=[f"pod.inputs={inputs}", "pod.modes=[8]"]))
+    surrogate = train_surrogate(
+        plate.campaign(24), settings(model, overrides=[f"pod.inputs={inputs}", "pod.modes=[8]"])
+    )
     mu = plate.parameters(3, seed=9)
     truth = plate.displacement(mu)
     nothing = e2(truth, np.zeros_like(truth))
@@ -37,7 +39,7 @@ def test_runs_never_seen_are_predicted(model: str, inputs: str) -> None:
 
 
 def test_test_runs_do_not_enter_and_cross_validation_chooses() -> None:
-    surrogate = train(plate.campaign(16), settings("pod-rbf", overrides=["pod.modes=[1, 6]"]))
+    surrogate = train_surrogate(plate.campaign(16), settings("pod-rbf", overrides=["pod.modes=[1, 6]"]))
     record = surrogate.record
     assert len(record.fitted_runs) == 16
     assert not record.validation_runs
@@ -49,7 +51,7 @@ def test_test_runs_do_not_enter_and_cross_validation_chooses() -> None:
 
 
 def test_runs_named_for_validation_are_the_ones_that_choose() -> None:
-    named = train(
+    named = train_surrogate(
         plate.campaign(16), settings("pod-gpr", overrides=["validation.runs=[run_003, run_007]", "pod.modes=[4]"])
     )
     assert named.record.validation_runs == ("run_003", "run_007")
@@ -57,7 +59,7 @@ def test_runs_named_for_validation_are_the_ones_that_choose() -> None:
 
 
 def test_between_trained_times_the_course_is_interpolated_and_held_at_its_ends() -> None:
-    surrogate = train(
+    surrogate = train_surrogate(
         plate.campaign(12),
         settings("pod-rbf", overrides=["pod.inputs=trajectory", "pod.modes=[4]", "physics.clock=off"]),
     )
@@ -70,7 +72,9 @@ def test_between_trained_times_the_course_is_interpolated_and_held_at_its_ends()
 
 
 def test_reconstruction_is_the_projection_on_the_modes() -> None:
-    surrogate = train(plate.campaign(12), settings("pod-gpr", overrides=["pod.modes=[3]", "pod.inputs=trajectory"]))
+    surrogate = train_surrogate(
+        plate.campaign(12), settings("pod-gpr", overrides=["pod.modes=[3]", "pod.inputs=trajectory"])
+    )
     core = surrogate.core
     assert isinstance(core, PodRegression)
     states = plate.displacement(plate.parameters(1, seed=5))[0]
@@ -80,7 +84,7 @@ def test_reconstruction_is_the_projection_on_the_modes() -> None:
 
 
 def test_one_training_run_is_repeated_whatever_is_asked() -> None:
-    surrogate = train(plate.campaign(1), settings("pod-gpr"))
+    surrogate = train_surrogate(plate.campaign(1), settings("pod-gpr"))
     asked = surrogate.predict(plate.parameters(1, seed=5)[0])
     np.testing.assert_allclose(asked, plate.displacement(plate.parameters(1))[0], atol=1e-4)
     assert any("one training run" in note for note in surrogate.record.notes)
@@ -92,4 +96,4 @@ def still(runs: int) -> Campaign:
 
 def test_a_campaign_in_which_nothing_moves_is_refused() -> None:
     with pytest.raises(SurrogateError, match="no training run moves"):
-        train(still(6), settings("pod-gpr"))
+        train_surrogate(still(6), settings("pod-gpr"))

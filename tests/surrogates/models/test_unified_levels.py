@@ -10,7 +10,7 @@ from surrogates.data.graphs import Graphs
 from surrogates.data.inputs import InputScaling, Ranges
 from surrogates.models.unified import Unified
 from surrogates.settings import settings as choose
-from surrogates.training.train import train
+from surrogates.training.train import train_surrogate
 
 
 def unified(*overrides: str) -> Unified:
@@ -49,7 +49,7 @@ def test_a_coarse_prediction_asks_no_finer_decoder() -> None:
 
 def test_all_levels_train_at_once() -> None:
     chosen = choose("mh", overrides=("unified=true", "level.epochs=25", "level.latent=3", "level.batch=16"))
-    fitted = train(plate.campaign(10), chosen)
+    fitted = train_surrogate(plate.campaign(10), chosen)
     assert list(fitted.record.fits) == [1]
     assert fitted.level_names == {"MH2": 2, "MH1": 1}
     history = fitted.history(1)["total"]
@@ -58,5 +58,5 @@ def test_all_levels_train_at_once() -> None:
 
 def test_the_same_seed_gives_the_same_network() -> None:
     chosen = choose("mh", overrides=("unified=true", "level.epochs=2", "level.latent=3"))
-    first, second = (train(plate.campaign(6), chosen).core.tensors()["levels"] for _ in range(2))
+    first, second = (train_surrogate(plate.campaign(6), chosen).core.tensors()["levels"] for _ in range(2))
     assert all(torch.equal(first[name], second[name]) for name in first)

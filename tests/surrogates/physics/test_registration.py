@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 from scipy import sparse
 
 from surrogates.data.campaign import Campaign, Mirror
-from surrogates.data.samples import Notes, Split
+from surrogates.data.samples import Notes, ValidationSplit
 from surrogates.physics.clock import Clock
 from surrogates.physics.derived import SPEED, STRESS, DerivedInputs, logarithms
 from surrogates.physics.registration import Registration
 from surrogates.physics.symmetry import Symmetry, may_be_odd
 from surrogates.settings import settings
 from surrogates.storage.folder import load, save
-from surrogates.training.train import train
+from surrogates.training.train import train_surrogate
 
 DIMENSIONS = (SPEED, None, STRESS)
 # x -> 1 - x on the plate's grid, node by node.
@@ -94,7 +94,7 @@ def test_undo_brings_a_registered_run_back_to_its_own_clock() -> None:
 
 def test_a_run_and_its_image_stand_on_the_same_side_of_a_split() -> None:
     original = campaign(6)
-    parts = registration(original).split(Split(np.array([0, 2, 5]), np.array([1, 4])), 6)
+    parts = registration(original).split(ValidationSplit(np.array([0, 2, 5]), np.array([1, 4])), 6)
     np.testing.assert_array_equal(parts.training, [0, 2, 5, 6, 8, 11])
     np.testing.assert_array_equal(parts.validation, [1, 4])
 
@@ -128,7 +128,7 @@ def test_the_identity_changes_nothing() -> None:
 
 
 def test_pod_regression_stands_behind_it_and_starts_at_zero(tmp_path) -> None:  # type: ignore[no-untyped-def]
-    surrogate = train(campaign(24), settings("pod-gpr"))
+    surrogate = train_surrogate(campaign(24), settings("pod-gpr"))
     physics = surrogate.record.physics
     assert {"inputs", "clock", "symmetry"} <= physics.keys()
     asked = plate.parameters(3, seed=9)
@@ -138,7 +138,7 @@ def test_pod_regression_stands_behind_it_and_starts_at_zero(tmp_path) -> None:  
 
 
 def test_where_nothing_is_known_nothing_is_derived_from_units() -> None:
-    surrogate = train(plate.campaign(12, parameter_units=("1", "1", "1")), settings("pod-gpr"))
+    surrogate = train_surrogate(plate.campaign(12, parameter_units=("1", "1", "1")), settings("pod-gpr"))
     assert surrogate.registration.clock.is_identity
     assert surrogate.registration.symmetry.is_identity
     assert not any(
@@ -148,4 +148,4 @@ def test_where_nothing_is_known_nothing_is_derived_from_units() -> None:
 
 def test_all_can_be_switched_off() -> None:
     off = ["inputs.derived=off", "physics.clock=off", "physics.symmetry=off"]
-    assert train(campaign(12), settings("pod-gpr", overrides=off)).registration.is_identity
+    assert train_surrogate(campaign(12), settings("pod-gpr", overrides=off)).registration.is_identity

@@ -16,7 +16,7 @@ from surrogates.errors import SurrogateError
 from surrogates.reductions import reduction
 from surrogates.settings import settings
 from surrogates.storage.folder import load, save
-from surrogates.training.train import train
+from surrogates.training.train import train_surrogate
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "add_reduction.py"
 SMALL = ("level.latent=3", "level.epochs=2", "levels=[2, 1]", "level.mlp.widths=[8]", "level.reduction=quadratic")
@@ -34,7 +34,7 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 @pytest.mark.parametrize("more", [(), ("level.start=plain",), ("transfer.encoder=concat",)])
 def test_a_cascade_of_it_learns_and_is_stored(more: tuple[str, ...], registered: None, tmp_path: Path) -> None:
-    made = train(plate.campaign(), settings("mh", overrides=[*SMALL, *more]), device="cpu")
+    made = train_surrogate(plate.campaign(), settings("mh", overrides=[*SMALL, *more]), device="cpu")
     save(made, tmp_path / "model")
     asked = np.array([20.0, 1.0, 3e8])
     np.testing.assert_array_equal(load(tmp_path / "model").predict(asked), made.predict(asked))
@@ -49,7 +49,7 @@ def test_it_is_a_quadratic_function_of_the_latent_vector(registered: None) -> No
 
 
 def test_a_model_is_refused_by_name_where_it_is_not_registered(registered: None, tmp_path: Path) -> None:
-    save(train(plate.campaign(), settings("mh", overrides=SMALL), device="cpu"), tmp_path / "model")
+    save(train_surrogate(plate.campaign(), settings("mh", overrides=SMALL), device="cpu"), tmp_path / "model")
     config.REDUCTIONS.remove("quadratic")
     with pytest.raises(SurrogateError, match=r"model.*reduction.*'quadratic'.*'gcn', 'ae' or 'pod'"):
         load(tmp_path / "model")
@@ -57,7 +57,7 @@ def test_a_model_is_refused_by_name_where_it_is_not_registered(registered: None,
 
 def test_without_its_encoder_a_unified_network_cannot_use_it(registered: None) -> None:
     with pytest.raises(SurrogateError, match="QuadraticReduction cannot do without its encoder; set unified=false"):
-        train(plate.campaign(), settings("mh", overrides=[*SMALL, "unified=true"]), device="cpu")
+        train_surrogate(plate.campaign(), settings("mh", overrides=[*SMALL, "unified=true"]), device="cpu")
 
 
 def test_the_example_is_as_short_as_it_says() -> None:

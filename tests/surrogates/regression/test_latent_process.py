@@ -16,7 +16,7 @@ from surrogates.regression.latent_process import LatentProcess, fit_process
 from surrogates.settings import settings
 from surrogates.storage.folder import load, save
 from surrogates.surrogate import Surrogate
-from surrogates.training.train import train
+from surrogates.training.train import train_surrogate
 
 RUNS = np.random.default_rng(0).uniform(-1, 1, (12, 2))
 TIME = np.array([-1.0, -0.4, 0.1, 0.5, 1.0])
@@ -91,7 +91,9 @@ def test_it_can_be_differentiated_by_the_parameters_also_on_a_training_run() -> 
 
 
 def trained(wish: str, *more: str, runs: int = 12) -> Surrogate:
-    return train(plate.campaign(runs), settings("mh", overrides=["level.epochs=3", f"level.regression={wish}", *more]))
+    return train_surrogate(
+        plate.campaign(runs), settings("mh", overrides=["level.epochs=3", f"level.regression={wish}", *more])
+    )
 
 
 def shares(surrogate: Surrogate) -> list[float]:

@@ -14,12 +14,14 @@ from surrogates.errors import SurrogateError
 from surrogates.settings import settings
 from surrogates.storage.export import export
 from surrogates.surrogate import Surrogate
-from surrogates.training.train import train
+from surrogates.training.train import train_surrogate
 
 
 @pytest.fixture(scope="module")
 def surrogate() -> Surrogate:
-    return train(plate.campaign(8), settings("mh", overrides=["level.epochs=2", "transfer.upsampling=sparse"]))
+    return train_surrogate(
+        plate.campaign(8), settings("mh", overrides=["level.epochs=2", "transfer.upsampling=sparse"])
+    )
 
 
 def questions() -> tuple[np.ndarray, np.ndarray]:
@@ -70,6 +72,6 @@ def test_another_suffix_is_refused(surrogate: Surrogate, tmp_path: Path) -> None
 
 
 def test_a_pod_regression_is_refused(tmp_path: Path) -> None:
-    made = train(plate.campaign(6), settings("pod-rbf", overrides=["pod.modes=[2]"]))
+    made = train_surrogate(plate.campaign(6), settings("pod-rbf", overrides=["pod.modes=[2]"]))
     with pytest.raises(SurrogateError, match="pod-rbf is no network"):
         export(made, tmp_path / "model.onnx")

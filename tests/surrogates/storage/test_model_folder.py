@@ -13,12 +13,12 @@ from surrogates.errors import ModelFolderError
 from surrogates.settings import settings
 from surrogates.storage.folder import load, save
 from surrogates.surrogate import Surrogate
-from surrogates.training.train import train
+from surrogates.training.train import train_surrogate
 
 
 @pytest.fixture(scope="module")
 def surrogate() -> Surrogate:
-    return train(plate.campaign(8), settings("mh", overrides=["level.epochs=2"]))
+    return train_surrogate(plate.campaign(8), settings("mh", overrides=["level.epochs=2"]))
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def test_the_folder_says_what_the_surrogate_is_and_has_seen(folder: Path, surrog
 
 @pytest.mark.parametrize("model", ["pod-gpr", "pod-rbf"])
 def test_pod_regressions_come_back_bit_by_bit(model: str, tmp_path: Path) -> None:
-    made = train(plate.campaign(8), settings(model, overrides=["pod.modes=[3]"]))
+    made = train_surrogate(plate.campaign(8), settings(model, overrides=["pod.modes=[3]"]))
     again = load(save(made, tmp_path / "model"))
     mu = plate.parameters(2, seed=3)
     np.testing.assert_array_equal(again.predict(mu), made.predict(mu))

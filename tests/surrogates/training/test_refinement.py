@@ -12,7 +12,7 @@ from surrogates.data.graphs import Graphs
 from surrogates.errors import SurrogateError
 from surrogates.settings import settings as choose
 from surrogates.training.refinement import Refined
-from surrogates.training.train import train
+from surrogates.training.train import train_surrogate
 
 
 def hierarchy() -> Graphs:
@@ -71,7 +71,7 @@ def test_a_refined_graph_hangs_together() -> None:
 
 def test_a_cascade_refines_between_coarse_and_fine() -> None:
     chosen = choose("mh", overrides=("level.epochs=3", "level.latent=3", "refinement.adaptive=true"))
-    fitted = train(plate.campaign(8), chosen)
+    fitted = train_surrogate(plate.campaign(8), chosen)
     coarse, fine = (fitted.graphs.n_nodes(k) for k in (2, 1))
     assert coarse == plate.SIDES[2] ** 2
     assert coarse < fine < plate.SIDES[1] ** 2
@@ -81,10 +81,10 @@ def test_a_cascade_refines_between_coarse_and_fine() -> None:
 def test_levels_may_not_be_left_out() -> None:
     chosen = choose("mh", overrides=("refinement.adaptive=true", "levels=[2, 0]"))
     with pytest.raises(SurrogateError, match=r"goes level by level; found levels \[2, 0\]"):
-        train(plate.campaign(8), chosen)
+        train_surrogate(plate.campaign(8), chosen)
 
 
 def test_the_full_mesh_is_no_refined_level() -> None:
     chosen = choose("mh", overrides=("refinement.adaptive=true", "levels=[1, 0]", "level.epochs=1"))
     with pytest.raises(SurrogateError, match="ends on level 1"):
-        train(plate.campaign(8), chosen)
+        train_surrogate(plate.campaign(8), chosen)

@@ -17,7 +17,7 @@ from surrogates.settings import LevelSettings, settings
 from surrogates.training import loop
 from surrogates.training.checkpoints import Checkpoints
 from surrogates.training.loop import Diverged, Epoch, Objective, device_of, fit, learning_rates, set_up
-from surrogates.training.train import train
+from surrogates.training.train import train_surrogate
 
 SETTINGS = LevelSettings(epochs=12, batch=8, learning_rate=0.05, schedule="one_cycle")
 
@@ -190,7 +190,7 @@ def test_a_device_that_is_not_there_is_refused() -> None:
 def test_the_error_told_is_the_distance_of_validation_nodes_in_metres(model: str) -> None:
     told: list[Epoch] = []
     campaign = plate.campaign(10)
-    surrogate = train(
+    surrogate = train_surrogate(
         campaign, settings(model, overrides=["level.epochs=1", "level.regression=network"]), report=told.append
     )
     validation = [campaign.runs.index(name) for name in surrogate.record.validation_runs]
