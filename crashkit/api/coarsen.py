@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -23,7 +24,8 @@ def coarsen(
 
     `nodes` are the exact node counts of level 1, 2, ..; or `ratios` by how much each level has fewer nodes than the
     finer one (default 8, 4, 4). `pair_distance`, m: see `crashkit.mesh.build_hierarchy`. `report(done, runs)` follows
-    the pass over the runs. An older hierarchy is replaced once the new one is complete.
+    the pass over the runs. An older hierarchy is replaced once the new one is complete. Parts that have no faces (beams,
+    particles) are named in a `UserWarning`, since their nodes take their displacements from other parts.
 
     Raises
     ------
@@ -34,7 +36,7 @@ def coarsen(
     """
     from crashkit.errors import MeshError
     from crashkit.mesh.hierarchy import build_hierarchy, ratios_to_counts
-    from crashkit.mesh.store import open_mesh, write_hierarchy
+    from crashkit.mesh.store import open_mesh, parts_without_faces, write_hierarchy
 
     if nodes is not None and ratios is not None:
         raise MeshError("both node counts and ratios were given; give one of them")
@@ -50,5 +52,7 @@ def coarsen(
         )
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from error
+    for text in parts_without_faces(Path(path)):
+        warnings.warn(text, stacklevel=2)
     write_hierarchy(path, hierarchy, progress=report)
     return hierarchy

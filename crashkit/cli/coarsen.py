@@ -47,6 +47,8 @@ def command(
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Build coarser meshes (subsets of the nodes) and store them in the dataset, with the maps between them."""
+    import warnings
+
     from crashkit.extras import need
     from crashkit.mesh.store import open_mesh, summarize_hierarchy
 
@@ -58,7 +60,8 @@ def command(
     factors = numbers(ratios, "--ratios", "8,4,4")
     if counts and factors:
         raise typer.BadParameter("give either --nodes or --ratios", param_hint="--ratios")
-    with Progress(f"selecting the nodes of {path}", quiet=json) as shown:
+    with warnings.catch_warnings(record=True) as told, Progress(f"selecting the nodes of {path}", quiet=json) as shown:
+        warnings.simplefilter("always", UserWarning)
         hierarchy = coarsen(
             path,
             counts or None,
@@ -67,6 +70,7 @@ def command(
             pair_distance=pair_distance,
             report=lambda done, runs: shown.step("interpolation errors", done, runs),
         )
+    without = [str(w.message) for w in told if w.category is UserWarning]
     levels = summarize_hierarchy(path)
     mesh = open_mesh(path)
     files = [] if vtp is None else _write_levels(vtp, hierarchy, mesh)
@@ -79,10 +83,13 @@ def command(
                 "levels": levels,
                 "vtp": files,
                 "picture": picture if drawn else None,
+                "parts_without_faces": without,
             }
         )
         return
     show(path, levels)
+    for text in without:
+        say(f"  {text}")
     if files:
         say(f"levels as VTP: {vtp}")
     what_next(picture if drawn else path, ("train", path, "-o", "model", "--test", "0.25"))

@@ -210,6 +210,39 @@ def open_mesh(path: Path) -> MeshArrays:
         return MeshArrays(np.asarray(at.values, np.float64), *others)
 
 
+def parts_without_faces(path: Path) -> list[str]:
+    """What to know of parts that have no face in the dataset at `path` (beams, particles), in words; one a part.
+
+    A hierarchy is made of faces. Nodes on none take the displacement of the nearest coarse node, which is one of another
+    part where their own has no face.
+
+    Raises
+    ------
+    ReadError
+        If the file is no crash dataset or lacks its faces.
+    """
+    with open_dataset(path, chunks=None) as dataset:
+        if "cell_part" not in dataset:
+            return []
+        cells, owner = dataset["cell_nodes"].values, dataset["cell_part"].values
+        faces, face_part = dataset["face_nodes"].values, dataset["face_part"].values
+        numbers, names = dataset["part_id"].values, dataset["part_name"].values
+    on_faces = np.zeros(int(max(cells.max(initial=-1), faces.max(initial=-1))) + 2, bool)  # the last one is node -1
+    on_faces[faces] = True
+    on_faces[-1] = True
+    out = []
+    for part in np.setdiff1d(owner, face_part):
+        nodes = np.unique(cells[owner == part])
+        loose = int((~on_faces[nodes]).sum())
+        if loose:
+            out.append(
+                f"part {numbers[part]} ({names[part]}) has no faces (beams, particles): its {loose} node{'s' if loose > 1 else ''} on no face of "
+                "another part move as the nearest node of another part does; leave it out with crashkit ingest "
+                f"--exclude-parts {numbers[part]}, or do not rely on predictions there"
+            )
+    return out
+
+
 @contextmanager
 def _open_group(path: Path, name: str) -> Iterator[xr.Dataset]:
     """A group of the dataset at `path`; raises DataError if it is not there."""

@@ -152,3 +152,34 @@ def test_a_machine_that_cannot_draw_gets_the_hierarchy_and_the_reason(
     assert "no image can be drawn" in err
     assert not (tmp_path / "levels.png").exists()
     assert len(read_hierarchy(path).levels) == 2
+
+
+def with_beam(path: Path, *, own_faces: bool) -> Path:
+    """The campaign with a beam to its last node, which lies on no face; the beam's part may have faces elsewhere."""
+    ds = campaign()
+    last = ds.sizes["node"] - 1
+    ds = ds.isel(face=~(ds["face_nodes"] == last).any("corner")).drop_vars(["part_id", "part_name"])
+    ds["part_id"], ds["part_name"] = ("part", [7, 9]), ("part", np.array(["frame", "spring"], "O"))
+    ds["cell_nodes"] = (("cell", "cell_corner"), np.array([[0, last]], np.int32))
+    ds["cell_type"], ds["cell_part"] = ("cell", np.array([3], np.uint8)), ("cell", np.array([1], np.int32))
+    if own_faces:
+        ds["face_part"][:10] = 1
+    write(ds, path)
+    return path
+
+
+def test_parts_without_faces_are_named_with_what_to_do(tmp_path: Path) -> None:
+    path = with_beam(tmp_path / "beam.nc", own_faces=False)
+    code, _, err = run(path, "--nodes", "120,30")
+    assert code == 0
+    told = " ".join(err.split())
+    assert "part 9 (spring) has no faces (beams, particles): its 1 node on no face of another part" in told
+    assert "--exclude-parts 9" in told
+    with pytest.warns(UserWarning, match=r"part 9 \(spring\) has no faces"):
+        crashkit.coarsen(path, [120, 30])
+
+
+def test_parts_with_faces_of_their_own_are_not_named(tmp_path: Path) -> None:
+    path = with_beam(tmp_path / "beam.nc", own_faces=True)
+    code, out, _ = run(path, "--nodes", "120,30", "--json")
+    assert (code, json.loads(out)["parts_without_faces"]) == (0, [])
