@@ -235,9 +235,10 @@ def parts_without_faces(path: Path) -> list[str]:
         nodes = np.unique(cells[owner == part])
         loose = int((~on_faces[nodes]).sum())
         if loose:
+            count = f"{loose} node{'s' if loose > 1 else ''}"
             out.append(
-                f"part {numbers[part]} ({names[part]}) has no faces (beams, particles): its {loose} node{'s' if loose > 1 else ''} on no face of "
-                "another part move as the nearest node of another part does; leave it out with crashkit ingest "
+                f"part {numbers[part]} ({names[part]}) has no faces (beams, particles): its {count} on no face of another "
+                "part move as the nearest node of another part does; leave it out with crashkit ingest "
                 f"--exclude-parts {numbers[part]}, or do not rely on predictions there"
             )
     return out
