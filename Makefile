@@ -11,8 +11,8 @@ DEMO   ?= demo
 demo: $(READY)
 	$(BIN)/crashkit demo -o $(DEMO)
 
-test: $(READY) check docs
-	$(BIN)/python -m pytest -n 2
+test: $(READY) check
+	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
 # What takes more than 40 s a test.
 nightly: $(READY)

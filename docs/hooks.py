@@ -39,6 +39,12 @@ def on_page_content(html: str, **_: Any) -> str:
     return re.sub(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', _formula, html, flags=re.DOTALL)
 
 
+def on_post_page(output: str, **_: Any) -> str:
+    """Pages of notebooks bring a script that fetches diagrams from the network; we draw none."""
+    scripts = re.compile(r"<script(?: [^>]*)?>(?:(?!</script>).)*mermaid(?:(?!</script>).)*</script>", re.DOTALL)
+    return scripts.sub("", output)
+
+
 def _formula(found: re.Match[str]) -> str:
     from html import unescape
 
