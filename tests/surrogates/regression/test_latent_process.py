@@ -12,7 +12,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 from surrogates.models.cascade import Cascade
 from surrogates.regression.gaussian import Gaussian
-from surrogates.regression.latent_process import LatentProcess, fit_process
+from surrogates.regression.latent_process import LatentProcess, fit_process, mix_in
 from surrogates.settings import settings
 from surrogates.storage.folder import load, save
 from surrogates.surrogate import Surrogate
@@ -126,3 +126,140 @@ def test_it_is_stored_and_counted(tmp_path: Path) -> None:
 @pytest.mark.parametrize("runs", [1, 2])
 def test_too_few_runs_leave_the_network_alone(runs: int) -> None:
     assert shares(trained("mean", runs=runs)) == [0, 0]
+
+
+# The process itself
+
+
+def test_it_passes_through_the_training_runs_at_trained_times() -> None:
+    process = fitted()
+    for run in range(12):
+        found = process(at(np.repeat(RUNS[run : run + 1], 5, axis=0), TIME))
+        np.testing.assert_allclose(found, courses()[run], atol=1e-3)
+
+
+def test_far_from_all_runs_it_is_the_mean_course_and_a_linear_trend() -> None:
+    """The kernel's first part has died out there, so that second differences vanish."""
+    process = fitted()
+    longest = 1 / np.linalg.svd(process.mix.numpy())[1].min()
+    far = [np.array([[60.0, -40.0]]) * longest * k for k in (1, 2, 3)]
+    a, b, c = (process(at(np.repeat(x, 5, axis=0), TIME)).numpy() for x in far)
+    assert np.abs(c - a).max() > 1e-2, "there is a trend"
+    np.testing.assert_allclose(a - 2 * b + c, 0, atol=1e-9 * np.abs(c).max())
+
+
+def test_what_stands_behind_the_time_is_not_read() -> None:
+    process = fitted()
+    x = at(RUNS[:3] * 0.7, TIME[:3])
+    more = torch.cat([x, torch.randn(3, 4, dtype=torch.float64)], dim=1)
+    assert torch.equal(process(more), process(x))
+
+
+def test_runs_may_be_mixed_in_a_batch() -> None:
+    process = fitted()
+    x = at(np.array([[0.3, -0.2], [0.5, 0.1], [0.3, -0.2]]), np.array([-0.7, 0.3, 0.9]))
+    for k in range(3):
+        torch.testing.assert_close(process(x)[k], process(x[k : k + 1])[0], rtol=1e-9, atol=1e-9)
+
+
+def test_room_is_made_for_what_was_stored() -> None:
+    process = fitted()
+    again = LatentProcess.like(process.state_dict()).double()
+    again.load_state_dict(process.state_dict())
+    x = at(RUNS[:2], TIME[:2])
+    assert torch.equal(again(x), process(x))
+    assert (len(again.runs), again.mean.shape, again.mix.shape) == (12, (5, 3), (2, 2))
+
+
+def test_latent_numbers_that_move_nothing_have_no_say_in_the_kernel() -> None:
+    """Noise in a number of size 0 changes the kernel's numbers for no other."""
+    noisy = courses()
+    noisy[..., 2] = np.random.default_rng(5).normal(size=noisy.shape[:2])
+    sizes = np.array([1.0, 2.0, 0.0])
+    still = courses()
+    still[..., 2] = 0
+    one, other = (fit_process(RUNS, TIME, c, sizes, seed=0) for c in (noisy, still))
+    for name in ("numbers", "mix"):
+        torch.testing.assert_close(getattr(one, name), getattr(other, name))
+    weighted = fit_process(RUNS, TIME, noisy, np.ones(3), seed=0)
+    assert not torch.allclose(weighted.mix, one.mix, rtol=1e-3)
+
+
+# Its share in a level
+
+
+class Level:
+    process: LatentProcess | None = None
+
+
+class Judge:
+    """A level's samples, run by run, and losses by share: approximation as given, reconstruction misleading."""
+
+    def __init__(self, losses: dict[float, float] | None, runs: np.ndarray = RUNS) -> None:
+        self.losses, self.runs, self.level, self.asked = losses, runs, Level(), 0
+
+    def latents(self) -> tuple[torch.Tensor, torch.Tensor]:
+        self.asked += 1
+        some = len(self.runs)
+        inputs = np.concatenate(
+            [np.repeat(self.runs, 5, axis=0), np.tile(TIME, some)[:, None], np.ones((5 * some, 1))], axis=1
+        )
+        return torch.from_numpy(inputs).float(), torch.from_numpy(courses()[:some].reshape(-1, 3)).float()
+
+    def latent_sizes(self) -> torch.Tensor:
+        return torch.tensor([1.0, 2.0, 0.5])
+
+    def validation(self) -> torch.Tensor | None:
+        if self.losses is None:
+            return None
+        assert self.level.process is not None
+        loss = self.losses[float(self.level.process.share)]
+        return torch.tensor([loss, 1.0 - loss])
+
+    def mixed(self, wish: str) -> float:
+        mix_in(self.level, self, wish, 2, 5, 0)  # type: ignore[arg-type]
+        return 0.0 if self.level.process is None else float(self.level.process.share)
+
+
+@pytest.mark.parametrize("best", [0.0, 0.5, 1.0])
+def test_auto_takes_the_share_with_the_least_approximation_loss(best: float) -> None:
+    losses = {share: 0.4 if share != best else 0.1 for share in (0.0, 0.5, 1.0)}
+    assert Judge(losses).mixed("auto") == best
+
+
+def test_auto_takes_the_mean_where_nothing_can_be_compared_or_all_are_equal() -> None:
+    assert Judge(None).mixed("auto") == 0.5
+    assert Judge(dict.fromkeys((0.0, 0.5, 1.0), 0.3)).mixed("auto") == 0.5
+
+
+@pytest.mark.parametrize(("wish", "share"), [("process", 1.0), ("mean", 0.5)])
+def test_a_share_asked_for_is_taken_whatever_validation_says(wish: str, share: float) -> None:
+    assert Judge({0.0: 0.0, 0.5: 9.0, 1.0: 9.0}).mixed(wish) == share
+    assert Judge(None).mixed(wish) == share
+
+
+def test_a_network_alone_is_not_even_encoded() -> None:
+    judge = Judge(None)
+    assert judge.mixed("network") == 0.0
+    assert judge.asked == 0
+
+
+@pytest.mark.parametrize(("count", "share"), [(2, 0.0), (3, 0.5)])
+def test_three_runs_are_the_fewest(count: int, share: float) -> None:
+    assert Judge(None, RUNS[:count]).mixed("mean") == share
+
+
+def test_runs_that_agree_in_all_parameters_teach_a_process_nothing() -> None:
+    assert Judge(None, np.repeat(RUNS[:1], 5, axis=0)).mixed("mean") == 0.0
+    one_differs = np.repeat(RUNS[:1], 5, axis=0)
+    one_differs[3, 1] += 0.5
+    assert Judge(None, one_differs).mixed("mean") == 0.5
+
+
+def test_the_process_of_a_level_is_that_of_its_encoded_runs() -> None:
+    judge = Judge(None)
+    judge.mixed("process")
+    found, expected = judge.level.process, fitted()
+    assert found is not None
+    x = at(np.random.default_rng(3).uniform(-1, 1, (4, 2)), np.array([-0.9, 0.0, 0.3, 0.8]))
+    torch.testing.assert_close(found.double()(x), expected(x), rtol=1e-3, atol=1e-3)
