@@ -80,7 +80,13 @@ class StreamedPod:
         self._factor: NDArray[np.float32] | None = None  # U S, (3 * node, <= keep)
 
     def add(self, run: NDArray[np.floating]) -> None:
-        """One run (state, node, 3), m, finite. Raises ValueError for a run with other nodes than those before."""
+        """One run (state, node, 3), m, finite.
+
+        Raises
+        ------
+        ValueError
+            For a run with other nodes than those before.
+        """
         new = np.ascontiguousarray(run, np.float32).reshape(len(run), -1).T
         old = self._factor if self._factor is not None else np.empty((len(new), 0), np.float32)
         if len(old) != len(new):
@@ -95,7 +101,13 @@ class StreamedPod:
         self._factor = np.concatenate([(pair @ vectors[:, :kept]).astype(np.float32) for pair in _pairs(old, new)])
 
     def result(self) -> Pod:
-        """The decomposition of everything added. Raises ValueError where nothing was."""
+        """The decomposition of everything added.
+
+        Raises
+        ------
+        ValueError
+            Where nothing was.
+        """
         if self._factor is None:
             raise ValueError("no runs to decompose; expected at least one")
         factor = self._factor[:, : self.count]

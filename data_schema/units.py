@@ -75,7 +75,10 @@ def _quantity(name: str) -> tuple[tuple[int, int, int], str]:
 def unit_system(name: str) -> UnitSystem:
     """The system called `name`: "SI", or length-time-mass such as "mm-ms-kg", "mm-s-t", "m-s-kg".
 
-    Raises UnknownUnits with the known units of the part that was not understood.
+    Raises
+    ------
+    UnknownUnits
+        With the known units of the part that was not understood.
     """
     if name.upper() == "SI":
         return UnitSystem("SI", 1.0, 1.0, 1.0)
@@ -140,7 +143,10 @@ def to_si(unit: str) -> tuple[float, str]:
     label must be the one its owner reads. Units are understood by pint, in the spellings of CF ("m s-1"), of solvers
     ("N/mm2") and in capitals ("KM/H").
 
-    Raises UnknownUnits, saying what to write instead.
+    Raises
+    ------
+    UnknownUnits
+        Saying what to write instead.
     """
     text = " ".join(unit.split())
     if text in ("-", "1", ""):

@@ -25,7 +25,10 @@ _MEAN = 100.0
 class Known:
     """A trained process and its box, in the units of the process.
 
-    scale  (parameter,) SI value of one unit of the box
+    Attributes
+    ----------
+    scale
+        (parameter,) SI value of one unit of the box.
     """
 
     surrogate: Surrogate

@@ -20,7 +20,10 @@ class CampaignError(CrashkitError):
 class Range(BaseModel):
     """One parameter: from `low` to `high`, in `unit`.
 
-    odd  the parameter changes its sign when the structure is mirrored (an impact angle, a lateral offset)
+    Attributes
+    ----------
+    odd
+        The parameter changes its sign when the structure is mirrored (an impact angle, a lateral offset).
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -120,7 +123,10 @@ def _condition(text: str, names: tuple[str, ...]) -> Callable[[Mapping[str, floa
 def read_box(path: str | Path) -> Box:
     """The box in a YAML file: `parameters: {impact_speed: {low: 5, high: 35, unit: m/s}}`, and `constraints`.
 
-    Raises CampaignError where the file cannot be read or says something else.
+    Raises
+    ------
+    CampaignError
+        Where the file cannot be read or says something else.
     """
     return checked(Box, {k: v for k, v in read_yaml(path).items() if k in ("parameters", "constraints")}, path)
 

@@ -22,7 +22,13 @@ _UNUSED = {
 
 
 def template_files(home: Path, patterns: Sequence[str]) -> list[Path]:
-    """The files that `patterns` (relative to `home`) mean, sorted. Raises CampaignError where one means none."""
+    """The files that `patterns` (relative to `home`) mean, sorted.
+
+    Raises
+    ------
+    CampaignError
+        Where one means none.
+    """
     out: list[Path] = []
     for pattern in patterns:
         found = sorted(p for p in home.glob(pattern) if p.is_file())
@@ -71,7 +77,10 @@ def write_deck(folder: Path, templates: Sequence[Path], files: Sequence[Path], v
 def arguments(command: Sequence[str], values: Mapping[str, Any]) -> list[str]:
     """`command` with {name} replaced by values; a number is written with ten significant digits.
 
-    Raises CampaignError for a name that is not among `values`.
+    Raises
+    ------
+    CampaignError
+        For a name that is not among `values`.
     """
     out = []
     for word in command:
@@ -97,7 +106,10 @@ def arguments(command: Sequence[str], values: Mapping[str, Any]) -> list[str]:
 def program_of(command: Sequence[str], home: Path) -> str:
     """The program that `command` starts, as a path; looked for beside the campaign file, then on the PATH.
 
-    Raises CampaignError where there is none.
+    Raises
+    ------
+    CampaignError
+        Where there is none.
     """
     first = command[0].replace("{study}", str(home.resolve()))
     if "/" in first or (home / first).is_file():

@@ -76,16 +76,30 @@ class Study(Box):
     """A campaign.
 
     parameters, constraints  the box
-    template   deck files (patterns) into which `{{impact_speed}}` is written, with arithmetic: {{ "%10.4f" | format(t / 1000) }}
-    files      further files (patterns) that every run needs beside the deck
-    prepare    a command of the user's that writes the deck; {impact_speed} is a value, {study} this file's folder
-    command    the command that computes one run, in the run's folder
-    results    what ingest is given of a run's folder (a pattern); default: the folder
-    finished   how a run that ended well is known; default: what OpenRadioss and LS-DYNA write
-    at_a_time  runs computed at the same time; timeout: of one run, s or "10 min"
-    nodes      sizes of the mesh hierarchy, where the model wants one
-    model      what is trained (pod-gpr, mh, ...), with `settings`
-    until, confidence, most_runs, most_hours, least_gain   when the loop ends
+
+    Attributes
+    ----------
+    template
+        Deck files (patterns) into which `{{impact_speed}}` is written, with arithmetic: {{ "%10.4f" | format(t /
+        1000) }}.
+    files
+        Further files (patterns) that every run needs beside the deck.
+    prepare
+        A command of the user's that writes the deck; {impact_speed} is a value, {study} this file's folder.
+    command
+        The command that computes one run, in the run's folder.
+    results
+        What ingest is given of a run's folder (a pattern); default: the folder.
+    finished
+        How a run that ended well is known; default: what OpenRadioss and LS-DYNA write.
+    at_a_time
+        Runs computed at the same time; timeout: of one run, s or "10 min".
+    nodes
+        Sizes of the mesh hierarchy, where the model wants one.
+    model
+        What is trained (pod-gpr, mh, ...), with `settings`.
+    until, confidence, most_runs, most_hours, least_gain
+        When the loop ends.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -146,7 +160,13 @@ def length_of(text: str) -> float:
 
 
 def read_study(path: str | Path) -> Study:
-    """The campaign file at `path`. Raises CampaignError that names the place."""
+    """The campaign file at `path`.
+
+    Raises
+    ------
+    CampaignError
+        That names the place.
+    """
     study: Study = checked(Study, read_yaml(path), path)
     study.wish()
     return study

@@ -37,7 +37,10 @@ class Curves:
 def write_curves(run: Run, units: str, folder: Path) -> None:
     """Keep the curves of `run`, changed to SI, beside its arrays; nothing where it has none.
 
-    Raises ReadError where the run has curves that cannot be read.
+    Raises
+    ------
+    ReadError
+        Where the run has curves that cannot be read.
     """
     try:
         history = run.history()

@@ -42,14 +42,24 @@ Progress = Callable[[int, int, str], None]
 class IngestSummary:
     """What an ingest did.
 
-    runs             names of all runs in the dataset, in its order
-    added, replaced  those written now; unchanged: named again but already there
-    resumed          how many of them an earlier, interrupted start had read
-    skipped          run -> why it is not in the dataset
-    alignment_error  run -> estimated error of the change to the common times, m; of the runs written now
-    notes            what else is worth knowing, such as parts left out
-    scale            size, duration, largest displacement and speed of the runs written now
-    question         what to ask where they are absurd, so that the units may be wrong; empty where they are not
+    Attributes
+    ----------
+    runs
+        Names of all runs in the dataset, in its order.
+    added, replaced
+        Those written now; unchanged: named again but already there.
+    resumed
+        How many of them an earlier, interrupted start had read.
+    skipped
+        run -> why it is not in the dataset.
+    alignment_error
+        run -> estimated error of the change to the common times, m; of the runs written now.
+    notes
+        What else is worth knowing, such as parts left out.
+    scale
+        Size, duration, largest displacement and speed of the runs written now.
+    question
+        What to ask where they are absurd, so that the units may be wrong; empty where they are not.
     """
 
     output: Path
@@ -91,27 +101,49 @@ def ingest(
 ) -> IngestSummary:
     """Read all runs in `sources` (files or folders) and write them as one dataset to `output` (`.zarr` or `.nc`).
 
-    params            table of design parameters (`crashkit.ingestion.parameter_table`), before those of the source
-    units             unit system of the source, e.g. "mm-ms-kg"; needed where the source states none
-    reader, mesh      source format by name; file with the faces where the source has none
-    time_step         time between two states, in the source's unit, where the source holds no times
-    names             how runs are called: text with {run} and {source}, such as "{source}-{run}"
-    parts             only these parts (number, title or glob); exclude_parts: without these
-    keep_rigid_walls  keep what the solver drew of rigid walls
-    fields            further result fields to keep, by name
-    time              common output times, s; without, those of the run with the fewest states
-    on_error          "stop" at the first run that cannot be used, or "skip" it and say so in the summary
-    allow_incomplete  take runs that were cut short; what is missing of them is NaN
-    overwrite         replace runs that the dataset already holds; without, they must be unchanged
-    workers           processes on this machine (a script that asks for several needs the usual
-                      `if __name__ == "__main__":`); scheduler: address of a Dask scheduler to use instead, whose
-                      workers see the same files
-    progress          called with (runs done, runs in all or 0, note)
-
     An existing dataset gets new runs appended at its own times; its mesh hierarchy goes on with them, since it depends
     on the mesh alone. Interrupted, the same call goes on where it was.
 
     Raises CrashkitError (ReadError, DataError, OutputError) with file and place.
+
+    Parameters
+    ----------
+    sources
+        Files and folders with runs.
+    output
+        The dataset, `.zarr` or `.nc`. If it exists, new runs are added to it.
+    params
+        Table of design parameters (CSV, JSON, XLSX); its values replace those of the source.
+    units
+        Unit system of the source, such as "mm-ms-kg"; needed if the source does not say its units.
+    reader
+        Use this reader instead of detecting the format.
+    mesh
+        File with the faces, if the source has none.
+    time_step
+        Time between two states in the source's unit, if the source has no times.
+    names
+        Names of the runs in the dataset: text with {run} and {source}, such as "{source}-{run}".
+    parts, exclude_parts
+        Only these parts, or all but these (number, title or pattern).
+    keep_rigid_walls
+        Keep rigid-wall elements.
+    fields
+        Further result fields to read, by name.
+    time
+        Common output times, s; default: those of the run with the fewest states.
+    on_error
+        "stop" at the first run that cannot be used, or "skip" it and list it in the summary.
+    allow_incomplete
+        Accept incomplete runs; their missing states are NaN.
+    overwrite
+        Replace runs that the dataset already contains; without it, they must be unchanged.
+    workers
+        Number of processes on this machine (a script that uses several needs `if __name__ == "__main__":`).
+    scheduler
+        Address of a Dask scheduler to use instead; its workers must be able to read the same files.
+    progress
+        Called with (runs done, runs in all or 0, note).
     """
     output = Path(output)
     paths = [Path(sources)] if isinstance(sources, (str, Path)) else [Path(s) for s in sources]

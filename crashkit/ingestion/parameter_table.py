@@ -51,8 +51,12 @@ class ParameterTable:
     def key(self, run: str) -> str:
         """The name of the row of `run`: its own, or the same number written otherwise where only one row is that.
 
-        Run 001 and run_001 have row 1 where the table knows its runs by their numbers alone. Raises DataError if there
-        is no such row, or if there are several.
+        Run 001 and run_001 have row 1 where the table knows its runs by their numbers alone.
+
+        Raises
+        ------
+        DataError
+            If there is no such row, or if there are several.
         """
         if run in self.rows:
             return run
@@ -70,7 +74,13 @@ class ParameterTable:
         raise DataError(f"{self.path}: has no row for run {run}; its rows are for {known}")
 
     def row(self, run: str) -> Mapping[str, tuple[float, str]]:
-        """The parameters of `run`. Raises DataError if it has no row."""
+        """The parameters of `run`.
+
+        Raises
+        ------
+        DataError
+            If it has no row.
+        """
         return self.rows[self.key(run)]
 
 
@@ -242,7 +252,10 @@ def _without_units_row(
 def _decimal_mark(body: Sequence[tuple[int, list[Any]]], chosen: Sequence[int], path: Path) -> str:
     """What a comma in the numbers of the table is: "decimal", "thousands", or "" where there is none.
 
-    Raises ReadError where both would do ("350,000"), or cells contradict each other.
+    Raises
+    ------
+    ReadError
+        Where both would do ("350,000"), or cells contradict each other.
     """
     cells = [(number, _SPACES.sub("", _text(line[k]))) for number, line in body for k in chosen]
     with_comma = [(number, text) for number, text in cells if "," in text]

@@ -33,10 +33,16 @@ _ALIKE = 0.999
 class MirrorPlane:
     """A plane in which the mesh is (nearly) its own image, and the map of fields.
 
-    normal  (3,), of length 1, its largest component positive; offset, m: the plane is normal . x = offset
-    to_image  (n, n): row i holds the weights with which the field at the mirror image of node i is put together
-    mean, most, largest  distance, m, of mirrored nodes from the surface: mean, 99 of 100, largest
-    edge    mean edge length, m
+    Attributes
+    ----------
+    normal
+        (3,), of length 1, its largest component positive; offset, m: the plane is normal . x = offset.
+    to_image
+        (n, n): row i holds the weights with which the field at the mirror image of node i is put together.
+    mean, most, largest
+        Distance, m, of mirrored nodes from the surface: mean, 99 of 100, largest.
+    edge
+        Mean edge length, m.
     """
 
     normal: NDArray[np.float64]
@@ -71,11 +77,20 @@ class MirrorPlane:
 def mirror_planes(position: ArrayLike, face_nodes: ArrayLike, face_part: ArrayLike | None = None) -> list[MirrorPlane]:
     """Planes in which the mesh is its own image within `MEAN_WITHIN` and `MOST_WITHIN` edges, the best first.
 
-    position    (n, 3), m; face_nodes (m, 3 or 4), -1 in the last corner of a triangle among quadrilaterals
-    face_part   (m,) part of each face, from 0
-
     Sought along the axes and the principal axes of the surface; each plane is then moved and turned until mirrored
-    nodes lie closest to the nodes (an iterative closest point). Raises MeshError as `surface` does.
+    nodes lie closest to the nodes (an iterative closest point).
+
+    Parameters
+    ----------
+    position
+        (n, 3), m; face_nodes (m, 3 or 4), -1 in the last corner of a triangle among quadrilaterals.
+    face_part
+        (m,) part of each face, from 0.
+
+    Raises
+    ------
+    MeshError
+        As `surface` does.
     """
     mesh = surface(position, face_nodes, face_part)
     edge = float(np.linalg.norm(np.diff(mesh.position[mesh.edges], axis=1)[:, 0], axis=1).mean())
@@ -94,7 +109,13 @@ def mirror_planes(position: ArrayLike, face_nodes: ArrayLike, face_part: ArrayLi
 def mirror_plane(
     position: ArrayLike, face_nodes: ArrayLike, normal: ArrayLike, offset: float, face_part: ArrayLike | None = None
 ) -> MirrorPlane:
-    """The plane normal . x = offset and its map, however well it fits. Raises MeshError as `surface` does."""
+    """The plane normal . x = offset and its map, however well it fits.
+
+    Raises
+    ------
+    MeshError
+        As `surface` does.
+    """
     mesh = surface(position, face_nodes, face_part)
     edge = float(np.linalg.norm(np.diff(mesh.position[mesh.edges], axis=1)[:, 0], axis=1).mean())
     direction = np.asarray(normal, np.float64)

@@ -59,7 +59,13 @@ def binout_files(folder: Path) -> list[Path]:
 
 
 def read_binout(files: Sequence[Path]) -> History:
-    """The curves of a binout family. Raises ReadError where it holds none, or is damaged."""
+    """The curves of a binout family.
+
+    Raises
+    ------
+    ReadError
+        Where it holds none, or is damaged.
+    """
     channels: list[Channel] = []
     columns: list[NDArray[np.float64]] = []
     times: NDArray[np.float64] | None = None

@@ -80,7 +80,13 @@ def require_options(reader: str, options: Mapping[str, object], known: Sequence[
 
 
 def time_step_option(options: Mapping[str, object]) -> float | None:
-    """The option `time_step`, the time between two states. Raises CrashkitError where it is no time."""
+    """The option `time_step`, the time between two states.
+
+    Raises
+    ------
+    CrashkitError
+        Where it is no time.
+    """
     given = options.get("time_step")
     try:
         step = None if given is None else float(str(given))

@@ -104,7 +104,13 @@ class D3plotFile:
             self._find_states(file, 0, geometry=False)
 
     def _check_header(self, size: int) -> int:
-        """Bytes that the header's counts ask for. Raises ReadError where they cannot be true."""
+        """Bytes that the header's counts ask for.
+
+        Raises
+        ------
+        ReadError
+            Where they cannot be true.
+        """
         with guarded(self.first):
             header = header_class()(str(self.first))
         words = header.raw_header

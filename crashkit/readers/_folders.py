@@ -37,7 +37,10 @@ def files_in(folder: Path) -> Iterator[Path]:
 def named(families: Iterable[tuple[str, str, Family]]) -> dict[str, Family]:
     """Name -> family, from (short name, whole name, family): the short name where no other has it, else the whole one.
 
-    Raises ReadError where two would still be called alike.
+    Raises
+    ------
+    ReadError
+        Where two would still be called alike.
     """
     listed = list(families)
     times = Counter(short for short, _, _ in listed)
@@ -57,7 +60,12 @@ def runs_in(
     """The runs of the folder `path` and of the folders in it; `find` looks into one folder.
 
     A family alone in its folder is called as the folder (in `path` itself by its own name with `own_name_at_top`),
-    several in one folder by their own names. Raises ReadError where two runs would be called alike.
+    several in one folder by their own names.
+
+    Raises
+    ------
+    ReadError
+        Where two runs would be called alike.
     """
     out: Collected[Family] = Collected()
     for folder in (path, *sorted(p for p in path.iterdir() if p.is_dir())):

@@ -269,7 +269,13 @@ class _Group:
 
 
 def _sort_cells(grid: Grid, place: str) -> tuple[_Group, _Group]:
-    """Faces and cells of a grid, each in the grid's order. Raises ReadError for cells of another shape."""
+    """Faces and cells of a grid, each in the grid's order.
+
+    Raises
+    ------
+    ReadError
+        For cells of another shape.
+    """
     sizes = np.diff(grid.offsets)
     types = grid.types.copy()
     types[(types == _POLYGON) & (sizes == 3)] = _TRIANGLE

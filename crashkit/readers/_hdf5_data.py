@@ -15,8 +15,11 @@ _DEPTH = 4
 def files_behind(dataset: Any, opened: Path, depth: int = 0) -> set[Path]:
     """The files beside `opened` that hold values of the h5py dataset: targets of links, sources of virtual datasets.
 
-    Raises ReadError where values are absent (a source that is missing, chunks that were never written), where they lie
-    as raw bytes in other files, or in files outside the folder of `opened`.
+    Raises
+    ------
+    ReadError
+        Where values are absent (a source that is missing, chunks that were never written), where they lie as raw
+        bytes in other files, or in files outside the folder of `opened`.
     """
     place = f"{opened}: {dataset.name}"
     own = Path(dataset.file.filename)

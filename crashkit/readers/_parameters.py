@@ -34,7 +34,10 @@ def split_title(title: str, is_unit: Callable[[str], bool]) -> tuple[str, str]:
 def parameter_name(title: str, place: str) -> str:
     """A name of letters, digits and underscores, made of a title without its unit.
 
-    Raises ReadError naming `place` where nothing is left of it, or too much.
+    Raises
+    ------
+    ReadError
+        Naming `place` where nothing is left of it, or too much.
     """
     name = re.sub(r"\W+", "_", title.strip()).strip("_")
     if not name:
@@ -47,7 +50,10 @@ def parameter_name(title: str, place: str) -> str:
 def parameter_columns(titles: Sequence[str], units: Sequence[str], place: str) -> list[tuple[str, str]]:
     """(name, unit) of every column, from its title and the unit stated beside it ("" for none).
 
-    Raises ReadError naming `place` and both columns where two would be one parameter.
+    Raises
+    ------
+    ReadError
+        Naming `place` and both columns where two would be one parameter.
     """
     from data_schema.units import is_unit
 

@@ -42,7 +42,10 @@ def starts_well(file: Path) -> bool:
 def beginning(file: Path) -> tuple[float, tuple[int, ...], int]:
     """Time, flags with counts, and size when unpacked, without reading (or unpacking) more than the beginning.
 
-    Raises ReadError where the file is no animation file or ends within its header.
+    Raises
+    ------
+    ReadError
+        Where the file is no animation file or ends within its header.
     """
     try:
         header = _first_bytes(file, _HEADER)
@@ -233,7 +236,13 @@ class _Cursor:
 
 
 def read_layout(content: Content) -> FileLayout:
-    """Walk through a whole file. Raises ReadError at the first place that cannot be."""
+    """Walk through a whole file.
+
+    Raises
+    ------
+    ReadError
+        At the first place that cannot be.
+    """
     cursor = _Cursor(content)
     if content.read(0, 4) != MAGIC:
         raise _no_animation(content.file, content.read(0, 4))

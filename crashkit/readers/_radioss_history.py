@@ -97,9 +97,14 @@ class _Records:
 
 
 def read_history(file: Path) -> History:
-    """The curves of one T01 file. Raises ReadError where it is none, or where its head is damaged.
+    """The curves of one T01 file.
 
     A file that was cut short within a sample gives the samples before it.
+
+    Raises
+    ------
+    ReadError
+        Where it is none, or where its head is damaged.
     """
     records = _Records(file)
     head = records.next("the title")

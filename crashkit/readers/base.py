@@ -33,14 +33,19 @@ class Part:
 class RunMesh:
     """The mesh of one run as its solver wrote it, everything included.
 
-    position   (node, 3) float64, solver's length unit: the undeformed configuration
-    node_id    (node,) int64
     face_nodes (face, 3 or 4) int32, 0-based, -1 in the last corner of a triangle: shells only; the outer skin
                of solids is found by ingest
     face_part  (face,) int32 index into `parts`
     face_id    (face,) int64 element number
     cell_nodes (cell, corner) int32, padded with -1: solids and beams; cell_type (cell,) uint8 VTK cell type
     cell_part, cell_id as for faces
+
+    Attributes
+    ----------
+    position
+        (node, 3) float64, solver's length unit: the undeformed configuration.
+    node_id
+        (node,) int64.
     """
 
     position: NDArray[np.float64]
@@ -80,19 +85,34 @@ class Parameter:
 class Run(ABC):
     """One solver run, opened lazily. Everything is in the units of its source.
 
-    name        unique in its source: folder or file name, or the number in the file
-    solver      "LS-DYNA", "OpenRadioss", ... as far as known
-    files       every file the run is read from, for checksums
-    time        (state,) float64
-    mesh        RunMesh
-    parameters  known from the source itself, often empty
-    fields      what `field` can give, by name
-    units       unit system if the source states one ("SI"), else None: the user must say
-    end_time    the end time the control data asks for, None where the source does not say
-    left_out    what the source holds and this reader does not give, by name
-    problems    reasons why the run is incomplete or damaged though it can be opened; ingest refuses such runs
-    notes       what a user should know though nothing is wrong, such as states that were listed twice
-    withheld    fields that are in the files and not offered: name -> why, and what to do
+    Attributes
+    ----------
+    name
+        Unique in its source: folder or file name, or the number in the file.
+    solver
+        "LS-DYNA", "OpenRadioss", ... as far as known.
+    files
+        Every file the run is read from, for checksums.
+    time
+        (state,) float64.
+    mesh
+        RunMesh.
+    parameters
+        Known from the source itself, often empty.
+    fields
+        What `field` can give, by name.
+    units
+        Unit system if the source states one ("SI"), else None: the user must say.
+    end_time
+        The end time the control data asks for, None where the source does not say.
+    left_out
+        What the source holds and this reader does not give, by name.
+    problems
+        Reasons why the run is incomplete or damaged though it can be opened; ingest refuses such runs.
+    notes
+        What a user should know though nothing is wrong, such as states that were listed twice.
+    withheld
+        Fields that are in the files and not offered: name -> why, and what to do.
     """
 
     name: str
@@ -128,7 +148,10 @@ class Run(ABC):
     def history(self) -> History | None:
         """Curves of energies, forces and the like, at times of their own; None where the source holds none.
 
-        Raises ReadError where they are there and cannot be read.
+        Raises
+        ------
+        ReadError
+            Where they are there and cannot be read.
         """
         return None
 
@@ -153,7 +176,13 @@ class Runs(Iterator[Run]):
         return tuple(self._openers)
 
     def open(self, name: str) -> Run:
-        """The run called `name`, without opening any other. Raises KeyError, or ReadError as in the iteration."""
+        """The run called `name`, without opening any other.
+
+        Raises
+        ------
+        KeyError, ReadError
+            As in the iteration.
+        """
         return self._openers[name]()
 
     def __next__(self) -> Run:

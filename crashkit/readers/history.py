@@ -13,7 +13,10 @@ from numpy.typing import NDArray
 class Channel:
     """One curve. `quantity` names what it measures for the change to SI, as in `data_schema.units`.
 
-    derived  said of curves the solver wrote as something else: "derivative of the impulse the solver writes"
+    Attributes
+    ----------
+    derived
+        Said of curves the solver wrote as something else: "derivative of the impulse the solver writes".
     """
 
     name: str
@@ -25,8 +28,12 @@ class Channel:
 class History:
     """The curves of one run, in the units of its source.
 
-    time     (sample,) float64, increasing
-    values   (sample, channel) float64
+    Attributes
+    ----------
+    time
+        (sample,) float64, increasing.
+    values
+        (sample, channel) float64.
     """
 
     time: NDArray[np.float64]

@@ -49,8 +49,12 @@ _FAR = 10
 class State:
     """The arrays of one state.
 
-    point_data  name -> (n,) or (n, components)
-    cell_data   name -> (c,) or (c, components), faces first, then lines
+    Attributes
+    ----------
+    point_data
+        Name -> (n,) or (n, components).
+    cell_data
+        Name -> (c,) or (c, components), faces first, then lines.
     """
 
     point_data: Arrays
@@ -72,27 +76,46 @@ def write_paraview(
 ) -> list[Path]:
     """Write the states of one run to `path`, for ParaView, PyVista and everything else that reads VTK files.
 
-    path        the suffix says what is written: `.pvd` a list of states beside a folder `NAME_states` with one
-                compressed binary VTU each; `.vtkhdf` one file with all states; `.vtu` or `.vtp` a single state.
-                Missing folders are made. What was there is replaced once everything new is written.
-    points      (n, 3) reference position, m
-    faces       (m, 3 or 4) 0-based nodes, -1 in the last corner of a triangle
-    time        (t,) s
-    point_data  name -> (t, n) or (t, n, components), or without t where an array is the same in all states.
-                Anything that can be indexed by state will do (numpy, HDF5, Zarr): one state is read at a time.
-    cell_data   the same with c = m + number of lines values, faces first
-    lines       (e, 2) edges without a face, written behind the faces
-    units       name of an array -> its unit, kept in the file (VTU: UNITS_LABEL, VTKHDF: attribute `units`)
-    alive       (t, m) bool, False once an element has eroded: becomes the cell array `alive`, and VTK's ghost
-                array, so that eroded elements are not drawn
-    deform      move the points by the array `displacement`. Nodes where it is NaN stay where they were last.
-    field_data  what belongs to the file as a whole: name -> number, text, or a row of either
-
     Beside a `.pvd` or `.vtkhdf` file stands `NAME_view.py`, which ParaView loads as a state (File > Load State): the
     warped mesh, coloured over one range for all states.
 
-    Returns the files written, the one to open first. Raises DataError where arrays and mesh do not belong
-    together, OutputError where `path` cannot be written.
+    Returns the files written, the one to open first.
+
+    Parameters
+    ----------
+    path
+        The suffix says what is written: `.pvd` a list of states beside a folder `NAME_states` with one compressed
+        binary VTU each; `.vtkhdf` one file with all states; `.vtu` or `.vtp` a single state. Missing folders are
+        made. What was there is replaced once everything new is written.
+    points
+        (n, 3) reference position, m.
+    faces
+        (m, 3 or 4) 0-based nodes, -1 in the last corner of a triangle.
+    time
+        (t,) s.
+    point_data
+        Name -> (t, n) or (t, n, components), or without t where an array is the same in all states. Anything that
+        can be indexed by state will do (numpy, HDF5, Zarr): one state is read at a time.
+    cell_data
+        The same with c = m + number of lines values, faces first.
+    lines
+        (e, 2) edges without a face, written behind the faces.
+    units
+        Name of an array -> its unit, kept in the file (VTU: UNITS_LABEL, VTKHDF: attribute `units`).
+    alive
+        (t, m) bool, False once an element has eroded: becomes the cell array `alive`, and VTK's ghost array, so
+        that eroded elements are not drawn.
+    deform
+        Move the points by the array `displacement`. Nodes where it is NaN stay where they were last.
+    field_data
+        What belongs to the file as a whole: name -> number, text, or a row of either.
+
+    Raises
+    ------
+    DataError
+        Where arrays and mesh do not belong together.
+    OutputError
+        Where `path` cannot be written.
     """
     times = _times(time)
     mesh = _mesh(points, faces, lines)
@@ -129,11 +152,17 @@ def write_states(
 ) -> list[Path]:
     """The same as `write_paraview` for states that come one after the other: only one is held in memory.
 
-    states    one `State` for each of `time`, all with the same arrays
-    constant  the arrays that are the same in all states
+    Parameters
+    ----------
+    states
+        One `State` for each of `time`, all with the same arrays.
+    constant
+        The arrays that are the same in all states.
 
-    Raises DataError also where `states` are fewer or more than `time`, or change their arrays; nothing is left
-    behind then.
+    Raises
+    ------
+    DataError
+        Also where `states` are fewer or more than `time`, or change their arrays; nothing is left behind then.
     """
     mesh = _mesh(points, faces, lines)
     extras = _Extras(units or {}, _field_data(field_data or {}))
@@ -143,7 +172,12 @@ def write_states(
 def read_state(path: str | os.PathLike[str], state: int = -1) -> tuple[float, Any]:
     """Time (s) and mesh, a `pyvista.UnstructuredGrid`, of one state of a `.pvd` or `.vtkhdf` file, through VTK.
 
-    `state` counts from 0, or back from -1. Raises ReadError for files that are neither, and states they lack.
+    `state` counts from 0, or back from -1.
+
+    Raises
+    ------
+    ReadError
+        For files that are neither, and states they lack.
     """
     import pyvista as pv
     from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline

@@ -14,9 +14,14 @@ from numpy.typing import NDArray
 class Ranges:
     """Smallest and largest value of arrays over all states, of vectors of their length.
 
-    of       name -> (smallest, largest), finite values only
-    on       name -> "POINTS" or "CELLS"
-    vectors  names of the point arrays with three components
+    Attributes
+    ----------
+    of
+        Name -> (smallest, largest), finite values only.
+    on
+        Name -> "POINTS" or "CELLS".
+    vectors
+        Names of the point arrays with three components.
     """
 
     of: dict[str, tuple[float, float]] = field(default_factory=dict)

@@ -34,14 +34,24 @@ N_MODES = 50  # as many singular values as the paper shows
 class Evaluation:
     """The comparison of `entries` on the test runs of `split`.
 
-    scores    label of an entry -> its scores
-    runs      one RunScores a test run: sizes of the truth, floors, costs of lifting
-    pods      level -> decomposition of the training runs on its nodes
-    timings   label -> milliseconds of a prediction; empty where not timed
-    context   name -> text for the methods section: data, split, versions, machine
-    group_names  grouping -> name of each group
-    sensors   where histories were taken; None without
-    files     ParaView files written of it (evaluation.report.files.write_run)
+    Attributes
+    ----------
+    scores
+        Label of an entry -> its scores.
+    runs
+        One RunScores a test run: sizes of the truth, floors, costs of lifting.
+    pods
+        Level -> decomposition of the training runs on its nodes.
+    timings
+        Label -> milliseconds of a prediction; empty where not timed.
+    context
+        Name -> text for the methods section: data, split, versions, machine.
+    group_names
+        Grouping -> name of each group.
+    sensors
+        Where histories were taken; None without.
+    files
+        ParaView files written of it (evaluation.report.files.write_run).
     """
 
     reference: Reference
@@ -142,7 +152,10 @@ def decompose(
 ) -> dict[int, Pod]:
     """POD of `runs` on the full mesh and on every coarse level, reading each run once: level -> Pod.
 
-    Raises EvaluationError where nothing moves.
+    Raises
+    ------
+    EvaluationError
+        Where nothing moves.
     """
     if not runs:
         raise EvaluationError("there is no training run to decompose; expected at least one")
@@ -181,12 +194,21 @@ def compare(
 ) -> Evaluation:
     """Compare `models` on the test runs of `split`; everything in this process unless given.
 
-    pods     decomposition of the training runs, where it is there already
-    scored   one RunScores a test run, in the order of `split.test`, where they were computed elsewhere
-    timed    whether predictions are timed here
-    sensors  where histories are taken; default: sensors.choose_sensors
+    Parameters
+    ----------
+    pods
+        Decomposition of the training runs, where it is there already.
+    scored
+        One RunScores a test run, in the order of `split.test`, where they were computed elsewhere.
+    timed
+        Whether predictions are timed here.
+    sensors
+        Where histories are taken; default: sensors.choose_sensors.
 
-    Raises EvaluationError where the models cannot be compared (see comparison.entries) or do not fit the data.
+    Raises
+    ------
+    EvaluationError
+        Where the models cannot be compared (see comparison.entries) or do not fit the data.
     """
     rows = entries(models, seeds_as_spread)
     predictors = predictors_of(models)

@@ -40,9 +40,14 @@ class Labels:
 class Mirror:
     """A plane in which the structure is its own image, as arrays.
 
-    reflection  (3, 3): what a vector becomes in the mirror
-    to_image    (node, node) of the full mesh: row i holds the weights of the field at the mirror image of node i
-    told        what it is and how well the mesh fits its image, in a sentence; `name` in a word
+    Attributes
+    ----------
+    reflection
+        (3, 3): what a vector becomes in the mirror.
+    to_image
+        (node, node) of the full mesh: row i holds the weights of the field at the mirror image of node i.
+    told
+        What it is and how well the mesh fits its image, in a sentence; `name` in a word.
     """
 
     reflection: NDArray[np.float64]
@@ -55,24 +60,41 @@ class Mirror:
 class Campaign:
     """The runs a surrogate may see, and nothing of the test runs.
 
-    parameters      (sim, parameter) float64, in the units of `parameter_units`
-    time            (state,) float64, s
-    displacement    level index -> (sim, state, node of that level, 3) float32, m. Called with 0 for the full mesh
-                    only by models that work there (POD baselines, AENN, GAENN); the cascade asks for its levels, and
-                    reads only validation runs of the full mesh, to judge lifted predictions.
-                    Anything that gives one run when indexed will do, so the full field need not be in memory.
-    full_edges      (e, 2) graph edges of level 0, for models that convolve there
-    levels          coarse levels, level 1 first; may be empty for POD baselines
-    runs            names of the runs, for messages and the model card
-    held_out        names of the runs that were kept away (the test runs), for the record
-    checksum        SHA-256 that identifies the dataset
-    points, faces   the full mesh (node, 3), m, and (face, corner), stored with the model so that it draws without data
-    labels          the solver's numbers and names on it
-    table_units     for each parameter the unit people write it in, and its value in `parameter_units`: ("MPa", 1e6)
-    dimensions      exponents of (kg, m, s) of each parameter's unit, None where it has none that is known
-    mirrors         planes of symmetry of the structure, the best first
-    erodes          whether elements disappear, so that displacements of nodes that nothing holds are missing
-    known           (sim, state) whether a run was computed that far; None: all were. Other states are in no loss
+    Attributes
+    ----------
+    parameters
+        (sim, parameter) float64, in the units of `parameter_units`.
+    time
+        (state,) float64, s.
+    displacement
+        Level index -> (sim, state, node of that level, 3) float32, m. Called with 0 for the full mesh only by
+        models that work there (POD baselines, AENN, GAENN); the cascade asks for its levels, and reads only
+        validation runs of the full mesh, to judge lifted predictions. Anything that gives one run when indexed will
+        do, so the full field need not be in memory.
+    full_edges
+        (e, 2) graph edges of level 0, for models that convolve there.
+    levels
+        Coarse levels, level 1 first; may be empty for POD baselines.
+    runs
+        Names of the runs, for messages and the model card.
+    held_out
+        Names of the runs that were kept away (the test runs), for the record.
+    checksum
+        SHA-256 that identifies the dataset.
+    points, faces
+        The full mesh (node, 3), m, and (face, corner), stored with the model so that it draws without data.
+    labels
+        The solver's numbers and names on it.
+    table_units
+        For each parameter the unit people write it in, and its value in `parameter_units`: ("MPa", 1e6).
+    dimensions
+        Exponents of (kg, m, s) of each parameter's unit, None where it has none that is known.
+    mirrors
+        Planes of symmetry of the structure, the best first.
+    erodes
+        Whether elements disappear, so that displacements of nodes that nothing holds are missing.
+    known
+        (sim, state) whether a run was computed that far; None: all were. Other states are in no loss.
     """
 
     parameters: NDArray[np.float64]

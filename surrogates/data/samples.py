@@ -122,7 +122,10 @@ class LevelRuns:
     def read(self, run: int) -> NDArray[np.float32]:
         """(state, node, 3), m, without missing values.
 
-        Raises SurrogateError naming run, state and node of a missing value, unless it is held (`settings.missing`).
+        Raises
+        ------
+        SurrogateError
+            Naming run, state and node of a missing value, unless it is held (`settings.missing`).
         """
         values = np.asarray(self._field[int(run)], np.float32)
         if self._chosen is not None:

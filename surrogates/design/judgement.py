@@ -19,10 +19,16 @@ _RESAMPLES = 2000
 class Judgement:
     """The error over the box, m, and between which bounds it lies with the asked confidence.
 
-    error, low, high  m
-    confidence        of the interval [low, high]
-    runs              left-out runs behind it
-    means             (resample,) the error over the box in each resample of these runs, m
+    Attributes
+    ----------
+    error, low, high
+        m.
+    confidence
+        Of the interval [low, high].
+    runs
+        left-out runs behind it.
+    means
+        (resample,) the error over the box in each resample of these runs, m.
     """
 
     error: float

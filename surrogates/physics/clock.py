@@ -26,10 +26,16 @@ _LONGEST = 4.0
 class Clock:
     """The rate of a run against the reference's, a product of powers of parameters, and its size.
 
-    speed      place of the speed among the parameters, None where there is no clock
-    exponents  (parameter,) of the rate; the speed's is a
-    reference  (parameter,) values for which rate and size are 1
-    start      s, when all clocks begin
+    Attributes
+    ----------
+    speed
+        Place of the speed among the parameters, None where there is no clock.
+    exponents
+        (parameter,) of the rate; the speed's is a.
+    reference
+        (parameter,) values for which rate and size are 1.
+    start
+        s, when all clocks begin.
     """
 
     speed: int | None
@@ -82,7 +88,10 @@ class Clock:
     ) -> NDArray:
         """A run's states (state, ..) at `time` as those of the reference at `grid`; the last slope goes on at the end.
 
-        parameters  (parameter,) of the run
+        Parameters
+        ----------
+        parameters
+            (parameter,) of the run.
         """
         if self.speed is None:
             return states

@@ -37,8 +37,12 @@ _TOKEN = re.compile(r"\*\*|\d+\.?\d*|\.\d+|[^\W\d]\w*|\S")
 class Column:
     """One input: a parameter as it is, warped, or the logarithm of a monomial of parameters.
 
-    powers  exponent of each parameter; for a parameter as it is, or warped, a single 1
-    width   w of asinh(x / w); 0 where it is not warped
+    Attributes
+    ----------
+    powers
+        Exponent of each parameter; for a parameter as it is, or warped, a single 1.
+    width
+        W of asinh(x / w); 0 where it is not warped.
     """
 
     powers: tuple[float, ...]
@@ -66,9 +70,14 @@ class Column:
 class DerivedInputs:
     """Which inputs a model reads in place of the parameters.
 
-    names    of the parameters
-    columns  as many as there are parameters, and as much in them: the way back exists
-    mixed    columns whose lengths may form a full matrix in a process
+    Attributes
+    ----------
+    names
+        Of the parameters.
+    columns
+        As many as there are parameters, and as much in them: the way back exists.
+    mixed
+        Columns whose lengths may form a full matrix in a process.
     """
 
     names: tuple[str, ...]
@@ -85,7 +94,13 @@ class DerivedInputs:
         return not self.mixed and not any(c.logarithm or c.width for c in self.columns)
 
     def apply(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(run, parameter) -> (run, column). Raises SurrogateError for a logarithm of what is not positive."""
+        """(run, parameter) -> (run, column).
+
+        Raises
+        ------
+        SurrogateError
+            For a logarithm of what is not positive.
+        """
         values = np.atleast_2d(np.asarray(parameters, np.float64))
         for k, name in enumerate(self.names):
             if any(c.logarithm and c.powers[k] for c in self.columns) and (values[:, k] <= 0).any():
@@ -130,7 +145,10 @@ class DerivedInputs:
 def logarithms(names: Sequence[str], parameters: NDArray[np.float64], *, warp: bool) -> DerivedInputs:
     """Logarithms of the parameters that are positive and spread; those that change sign warped, if asked.
 
-    parameters  (run, parameter)
+    Parameters
+    ----------
+    parameters
+        (run, parameter).
     """
     columns = []
     for k, row in enumerate(_unit_rows(len(names))):
@@ -217,7 +235,10 @@ def is_free(powers: Sequence[float], dimensions: Sequence[Dimension]) -> bool:
 def parse_monomial(text: str, names: Sequence[str]) -> tuple[float, ...]:
     """Powers of each parameter in a text such as "impact_speed**2/(yield_stress*thickness)"; nothing is evaluated.
 
-    Raises SurrogateError saying where it was not understood.
+    Raises
+    ------
+    SurrogateError
+        Saying where it was not understood.
     """
     powers = _Monomial(text, names).read()
     if not powers.any():

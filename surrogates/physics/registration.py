@@ -29,10 +29,15 @@ SIDE = "mirrored"
 class Registration:
     """How a campaign is registered.
 
-    inputs, clock, symmetry  see `surrogates.physics`
-    grid                     (state,) s, the reference's times on which registered runs are given
-    reach                    s, how far courses count in a process's likelihood: to the reference's own end, or all along.
-                             Beyond that end most courses are their last slope going on
+    Attributes
+    ----------
+    inputs, clock, symmetry
+        See `surrogates.physics`.
+    grid
+        (state,) s, the reference's times on which registered runs are given.
+    reach
+        s, how far courses count in a process's likelihood: to the reference's own end, or all along. Beyond that
+        end most courses are their last slope going on.
     """
 
     inputs: DerivedInputs
@@ -99,7 +104,10 @@ class Registration:
     ) -> NDArray:
         """What the `model` behind it, (run, input) and (state,) -> (run, state, ..), says of runs at their own times.
 
-        parameters  (run, parameter); time (state,), s
+        Parameters
+        ----------
+        parameters
+            (run, parameter); time (state,), s.
         """
         inputs = self.read(parameters)
         if self.clock.is_identity:

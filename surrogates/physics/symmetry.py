@@ -26,9 +26,14 @@ _TRIED = 3
 class Symmetry:
     """The images that a campaign is doubled by.
 
-    mirror   the plane, with the map of fields; None: no images
-    odd      parameters that change their sign in the mirror
-    flagged  whether the side is one more input
+    Attributes
+    ----------
+    mirror
+        The plane, with the map of fields; None: no images.
+    odd
+        Parameters that change their sign in the mirror.
+    flagged
+        Whether the side is one more input.
     """
 
     mirror: Mirror | None = None
@@ -93,7 +98,10 @@ def mirrored(
 def may_be_odd(names: Sequence[str], parameters: NDArray[np.float64]) -> list[tuple[str, ...]]:
     """Sets of parameters that could change their sign in a mirror: those with values on both sides of zero.
 
-    parameters  (run, parameter). All combinations of the first few, the fewest first; empty where none qualifies.
+    Parameters
+    ----------
+    parameters
+        (run, parameter). All combinations of the first few, the fewest first; empty where none qualifies.
     """
     both = [
         n for k, n in enumerate(names)

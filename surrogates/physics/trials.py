@@ -42,7 +42,10 @@ _ROUNDS = ((32, 3), (64, 2), (1 << 62, 1))
 class Folds:
     """Training runs in parts that are left out in turn, several times over where runs are few.
 
-    part  (round, run): the part in which each run is left out; -1: never
+    Attributes
+    ----------
+    part
+        (round, run): the part in which each run is left out; -1: never.
     """
 
     part: NDArray[np.int64]
@@ -77,9 +80,14 @@ class Folds:
 class Courses:
     """Runs and images as coefficients of one basis.
 
-    modes       (3 * node, mode) float32, orthonormal; the first three are translations
-    own         (run, state, mode); images (run, state, mode) of each plane
-    nodes       judged nodes, states judged states, truth (run, judged state, judged node, 3), m
+    Attributes
+    ----------
+    modes
+        (3 * node, mode) float32, orthonormal; the first three are translations.
+    own
+        (run, state, mode); images (run, state, mode) of each plane.
+    nodes
+        Judged nodes, states judged states, truth (run, judged state, judged node, 3), m.
     """
 
     modes: NDArray[np.float32]
@@ -136,8 +144,12 @@ class Courses:
 class Trials:
     """Judges registrations by folds; what was measured is kept.
 
-    parameters  (run, parameter) of the training runs
-    machine     "pod-gpr" or "pod-rbf": the regression
+    Attributes
+    ----------
+    parameters
+        (run, parameter) of the training runs.
+    machine
+        "pod-gpr" or "pod-rbf": the regression.
     """
 
     courses: Courses
@@ -254,7 +266,10 @@ def course_machine(
 ) -> Machine:
     """The regression `name` ("pod-gpr" or "pod-rbf") of whole courses (run, state, mode) by inputs (run, input).
 
-    mixed  inputs with a full matrix of lengths; none of them is constant
+    Parameters
+    ----------
+    mixed
+        Inputs with a full matrix of lengths; none of them is constant.
     """
     x = over_range(inputs, inputs)
     if name == "pod-rbf":

@@ -32,8 +32,12 @@ class Kernel:
 
     Source: Rasmussen and Williams 2006, equations 4.17 (Matern 3/2) and 4.20 (a matrix of lengths).
 
-    variance, slope, noise  c, b and the noise, in units of the outputs' spread
-    mix                     A (input, input), lower triangular: 1 / length on the diagonal
+    Attributes
+    ----------
+    variance, slope, noise
+        C, b and the noise, in units of the outputs' spread.
+    mix
+        A (input, input), lower triangular: 1 / length on the diagonal.
     """
 
     variance: float
@@ -64,8 +68,12 @@ class Gaussian:
     constant as the only basis function of infinite variance). The kernel's numbers maximise the likelihood of the
     outputs (equation 5.8) along its gradient (equation 5.9).
 
-    x      (sample, input), each column about [-1, 1]
-    mixed  columns whose lengths form a full lower-triangular matrix; the others have a length of their own
+    Attributes
+    ----------
+    x
+        (sample, input), each column about [-1, 1].
+    mixed
+        Columns whose lengths form a full lower-triangular matrix; the others have a length of their own.
     """
 
     def __init__(self, x: NDArray[np.float64], kernel: Kernel | None = None, mixed: Sequence[int] = ()) -> None:
@@ -77,7 +85,10 @@ class Gaussian:
     def fit(self, y: NDArray[np.float64], seed: int, start: Kernel | None = None) -> Gaussian:
         """Set the kernel by the likelihood of the outputs y (sample, output), in units of their spread.
 
-        start  a kernel of the same inputs to begin from
+        Parameters
+        ----------
+        start
+            A kernel of the same inputs to begin from.
         """
         if not self._informed:
             return self
@@ -177,7 +188,10 @@ def _most_likely(
 ) -> tuple[Kernel, float]:
     """The kernel of the largest likelihood, and that likelihood for each sample and output.
 
-    gram  (sample, sample): products of the outputs, with a trace of as many as there are samples
+    Parameters
+    ----------
+    gram
+        (sample, sample): products of the outputs, with a trace of as many as there are samples.
     """
     from scipy.optimize import minimize
 

@@ -27,11 +27,18 @@ _SHARES: Mapping[str, tuple[float, ...]] = {"process": (1.0,), "mean": (0.5,), "
 class LatentProcess(nn.Module):
     """Scaled inputs (b, parameter + 1, ..) -> z (b, latent); what stands behind the time is not read.
 
-    share     of the process in the level's regression; the rest is the network's
-    runs      (run, parameter) scaled parameters of the training runs
-    time      (state,) scaled, increasing
-    mean      (state, latent) mean course, and `pull` (run, state, latent) what each run adds to it
-    numbers   variance, variance of the linear trend, noise; `mix` (parameter, parameter), see `gaussian.Kernel`
+    Attributes
+    ----------
+    share
+        Of the process in the level's regression; the rest is the network's.
+    runs
+        (run, parameter) scaled parameters of the training runs.
+    time
+        (state,) scaled, increasing.
+    mean
+        (state, latent) mean course, and `pull` (run, state, latent) what each run adds to it.
+    numbers
+        Variance, variance of the linear trend, noise; `mix` (parameter, parameter), see `gaussian.Kernel`.
     """
 
     runs: Tensor
@@ -120,9 +127,14 @@ def fit_process(
 ) -> LatentProcess:
     """A process fitted to the courses (run, state, latent) of training runs with scaled parameters (run, parameter).
 
-    time   (state,) scaled
-    sizes  (latent,) how far the displacements move with each latent number: what counts in the kernel's likelihood
-    mixed  parameters whose lengths form a full matrix, see `gaussian.Gaussian`
+    Parameters
+    ----------
+    time
+        (state,) scaled.
+    sizes
+        (latent,) how far the displacements move with each latent number: what counts in the kernel's likelihood.
+    mixed
+        Parameters whose lengths form a full matrix, see `gaussian.Gaussian`.
     """
     machine = Gaussian(runs, mixed=mixed).fit((courses * sizes).reshape(len(runs), -1), seed)
     mean, pull = machine.expanded(courses.reshape(len(runs), -1))

@@ -32,7 +32,10 @@ def cascade_steps(
 ) -> dict[str, Any]:
     """Give each of `levels` (see `browser`) its `steps` and `scale`, put numbers into `arrays`; the rest is returned.
 
-    Raises SurrogateError for a part of the model that has no such form.
+    Raises
+    ------
+    SurrogateError
+        For a part of the model that has no such form.
     """
     writer = _Writer(arrays, prefix)
     for told in levels:
