@@ -19,6 +19,7 @@ from crashkit.cli._console import fail
 # The order of a first day's work; `crashkit --help` lists them so.
 COMMANDS = (
     "demo",
+    "run",
     "ingest",
     "info",
     "validate",

@@ -3,32 +3,18 @@
 from __future__ import annotations
 
 import json
-import shlex
-import shutil
-import subprocess
-import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from crashkit.cli._console import fail, say, table
-from crashkit.version import __version__
+from crashkit.cli._console import say, table, what_next
+from crashkit.cli._steps import Step, run_steps
 
 # As in the kart data's README: the first 27 of 36 runs train, the last 9 test.
 TEST_RUNS = "27:36"
 # The paper keeps about 1/8, 1/4 and 1/4 of the nodes; the demo mesh has 2400.
 NODES = "300,75,19"
-
-
-@dataclass(frozen=True)
-class Step:
-    """One command of the demo and why it is run; `result` is the file or folder that it leaves, if any."""
-
-    why: str
-    arguments: tuple[str, ...]
-    result: Path | None = None
 
 
 def steps(output: Path, source: Path) -> list[Step]:
@@ -40,7 +26,7 @@ def steps(output: Path, source: Path) -> list[Step]:
         return tuple(map(str, arguments))
 
     return [
-        Step("Solver runs become one dataset", command("ingest", source, "-o", data), data),
+        Step("Solver runs become one dataset", command("ingest", source, "-o", data), data, again=("--overwrite",)),
         Step("What is in it?", command("info", data)),
         Step("Does it keep the rules of a crash dataset?", command("validate", data)),
         Step(
@@ -49,7 +35,10 @@ def steps(output: Path, source: Path) -> list[Step]:
             output / "levels.png",
         ),
         *(
-            Step(why, command("train", data, "-o", models[name], "--model", name, "--test", TEST_RUNS), models[name])
+            Step(
+                why, command("train", data, "-o", models[name], "--model", name, "--test", TEST_RUNS), models[name],
+                again=("--overwrite",),
+            )
             for name, why in (
                 ("podnn", "The usual baseline: four modes and a network"),
                 ("pod-gpr", "The baseline to beat: modes and Gaussian processes"),
@@ -60,12 +49,13 @@ def steps(output: Path, source: Path) -> list[Step]:
             "How far can they be trusted? On runs none of them has seen",
             command("evaluate", data, *models.values(), "-o", report, "--write-vtu"),
             report,
+            again=("--overwrite",),
         ),
         Step(
             "A crash nobody computed: 22 m/s, 10 degrees, 350 MPa",
             command(
                 "predict", models["mh"], "--param", "impact_speed=22", "--param", "impact_angle=10",
-                "--param", "yield_stress=350MPa", "--full", "-o", output / "new_crash.pvd",
+                "--param", "yield_stress=350MPa", "-o", output / "new_crash.pvd",
             ),
             output / "new_crash.pvd",
         ),
@@ -77,61 +67,24 @@ def steps(output: Path, source: Path) -> list[Step]:
     ]  # fmt: skip
 
 
-def run_steps(todo: list[Step], done_file: Path) -> None:
-    """Run the steps in order; those that ended well last time, with the same command and version, are skipped.
-
-    From the first step that is run on, all are run: what they read has changed.
-    """
-    before: list[str] = json.loads(done_file.read_text()) if done_file.exists() else []
-    done: list[str] = []
-    renewed = False
-    for number, step in enumerate(todo, 1):
-        line = "crashkit " + shlex.join(step.arguments)
-        say(f"\n[{number}/{len(todo)}] {step.why}\n$ {line}")
-        mark = f"{__version__}: {line}"
-        if step.result is not None and step.result.exists():
-            if not renewed and before[number - 1 : number] == [mark]:
-                say("  (done before; --fresh starts again)")
-                done.append(mark)
-                continue
-            _remove(step.result)
-        renewed = renewed or step.result is not None
-        code = subprocess.run([sys.executable, "-m", "crashkit", *step.arguments], check=False).returncode
-        if code:
-            fail(f"step {number} of the demo ended with code {code}; its message stands above", code=code)
-        done.append(mark)
-        done_file.write_text(json.dumps(done))
-
-
-def _remove(result: Path) -> None:
-    """Make room for a result that is made again."""
-    if result.is_dir():
-        shutil.rmtree(result)
-    else:
-        result.unlink()
-
-
 def command(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for everything the demo makes.")] = Path(
         "demo"
     ),
-    fresh: Annotated[bool, typer.Option("--fresh", help="Start again, though earlier results are there.")] = False,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Make everything again.")] = False,
 ) -> None:
-    """Take the embedded kart runs from solver results to a report and ParaView files (a few minutes)."""
+    """Run the whole workflow on embedded kart crashes.
+
+    From solver results to a report and ParaView files, in a few minutes. Run again, it does only what is missing.
+    """
     from crashkit.dataset import demo_data
     from crashkit.errors import OutputError
 
-    done_file = output / "done.json"
     try:
         output.mkdir(parents=True, exist_ok=True)
-        if fresh:
-            done_file.unlink(missing_ok=True)
-        done_file.touch()
-        if done_file.stat().st_size == 0:
-            done_file.write_text("[]")
     except OSError as error:
         raise OutputError(f"{output}: cannot be written ({error.strerror}); choose another folder with -o") from error
-    run_steps(steps(output, demo_data()), done_file)
+    run_steps(steps(output, demo_data()), output / "done.json", fresh=fresh)
     show_result(output)
 
 
@@ -140,7 +93,7 @@ def show_result(output: Path) -> None:
     rows = json.loads((output / "report" / "report.json").read_text())["performance"]
     say("")
     table(
-        "Mean node error on runs no model has seen, lifted to the full mesh",
+        "Mean node error on runs no model has seen, on the full mesh",
         ("model", "error (cm)", "worst run (cm)", "POD floor (cm)"),
         (
             (r["model"], f"{r['error_cm']:.2f}", f"{r['worst_run_cm']:.2f}", f"{r['pod_floor_cm']:.2f}")
@@ -151,8 +104,10 @@ def show_result(output: Path) -> None:
     for path, what in (
         (output / "crash.html", "sliders: change speed, angle and strength and see the crash, in a browser"),
         (output / "report" / "report.html", "the report, in a browser"),
-        (output / "report" / "vtk", "truth, prediction and error of two runs, in ParaView (.pvd or .vtkhdf)"),
+        (output / "report" / "vtk", "truth, predictions and errors of two runs, in ParaView (.pvd)"),
         (output / "new_crash.pvd", "a crash nobody computed, in ParaView"),
         (output / "levels.png", "the meshes the surrogate works on"),
     ):
-        say(f"  {path}  {what}")
+        if path.exists():
+            say(f"  {path}  {what}")
+    what_next(None, ("info", output / "mh"), ("run", "study.yaml"))

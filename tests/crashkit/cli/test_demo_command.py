@@ -5,45 +5,94 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import click
 import pytest
+import typer
 
-from crashkit.cli.demo import Step, run_steps, steps
-
-
-def _step(folder: Path, name: str) -> Step:
-    """A step whose command does nothing; its result is there already, as if the command had made it."""
-    return Step(name, ("--version",), folder / name)
+from crashkit.cli._steps import Step, run_steps
+from crashkit.cli.demo import steps
+from crashkit.errors import OutputError
 
 
-def test_a_step_done_before_is_not_run_again(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    result = tmp_path / "result"
+def _step(folder: Path, name: str, **more) -> Step:
+    """A step that makes a file, unless it is there."""
+    return Step(name, ("export", "--help"), folder / name, **more)
+
+
+def run(todo: list[Step], done: Path, monkeypatch: pytest.MonkeyPatch, **more) -> list[str]:
+    """Run the steps, the commands replaced by writing the result; gives the names of those that were run."""
+    made = []
+
+    def write(number: int, arguments) -> None:
+        result = todo[number - 1].result
+        made.append(" ".join([todo[number - 1].why, *arguments[2:]]))
+        if result is not None:
+            result.write_text("made")
+
+    monkeypatch.setattr("crashkit.cli._steps._run", write)
+    run_steps(todo, done, **more)
+    return made
+
+
+def test_a_step_done_before_is_not_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    todo, done = [_step(tmp_path, "a", again=("--overwrite",))], tmp_path / "done.json"
+    assert run(todo, done, monkeypatch) == ["a"]
+    assert run(todo, done, monkeypatch) == []
+    assert run(todo, done, monkeypatch, fresh=True) == ["a --overwrite"]
+
+
+def test_what_stands_behind_a_renewed_step_is_renewed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    todo, done = [_step(tmp_path, "a"), _step(tmp_path, "b")], tmp_path / "done.json"
+    run(todo, done, monkeypatch)
+    (tmp_path / "a").unlink()
+    assert run(todo, done, monkeypatch) == ["a", "b"]
+
+
+def test_only_what_depends_on_a_change_is_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    known = {"a": "1", "b": "1"}
+    todo = [_step(tmp_path, n, depends=lambda n=n: known[n]) for n in known]
     done = tmp_path / "done.json"
-    run_steps([_step(tmp_path, "result")], done)
-    result.write_text("made")
-    capfd.readouterr()
-    run_steps([_step(tmp_path, "result")], done)
-    assert "done before" in capfd.readouterr().err
-    assert result.read_text() == "made"
+    run(todo, done, monkeypatch)
+    known["b"] = "2"
+    assert run(todo, done, monkeypatch) == ["b"]
 
 
-def test_what_stands_behind_a_renewed_step_is_renewed(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    todo = [_step(tmp_path, "first"), _step(tmp_path, "second")]
+def test_a_result_of_somebody_else_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a").write_text("years of work")
+    with pytest.raises(OutputError, match="was not made by this command"):
+        run([_step(tmp_path, "a")], tmp_path / "done.json", monkeypatch)
+    assert (tmp_path / "a").read_text() == "years of work"
+
+
+def test_an_interrupted_training_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    todo, done = [_step(tmp_path, "mh", again=("--overwrite",))], tmp_path / "done.json"
+
+    def interrupt(number: int, arguments) -> None:
+        (tmp_path / ".mh.training").mkdir()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("crashkit.cli._steps._run", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        run_steps(todo, done)
+    assert run(todo, done, monkeypatch) == ["mh --resume --overwrite"]
+
+
+def test_a_moved_folder_is_as_good_as_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "old").mkdir()
+    step = Step("a", ("export", "--help", str(tmp_path / "old" / "in")), tmp_path / "old" / "a")
+    run([step], tmp_path / "old" / "done.json", monkeypatch)
+    assert "old" not in (tmp_path / "old" / "done.json").read_text()
+    (tmp_path / "old").rename(tmp_path / "new")
+    step = Step("a", ("export", "--help", str(tmp_path / "new" / "in")), tmp_path / "new" / "a")
+    assert run([step], tmp_path / "new" / "done.json", monkeypatch) == []
+
+
+def test_a_failing_step_ends_with_its_code_and_is_not_noted_as_done(tmp_path: Path) -> None:
     done = tmp_path / "done.json"
-    run_steps(todo, done)
-    (tmp_path / "second").write_text("stale")  # the first result is missing, so both are made again
-    capfd.readouterr()
-    run_steps(todo, done)
-    assert "done before" not in capfd.readouterr().err
-    assert not (tmp_path / "second").exists()
-
-
-def test_a_failing_step_ends_the_demo_and_is_not_noted(tmp_path: Path) -> None:
-    done = tmp_path / "done.json"
-    with pytest.raises((click.exceptions.Exit, SystemExit, Exception)) as caught:
-        run_steps([_step(tmp_path, "good"), Step("bad", ("no-such-command",), tmp_path / "bad")], done)
-    assert getattr(caught.value, "exit_code", None) == 2
-    assert len(json.loads(done.read_text())) == 1
+    todo = [Step("bad", ("no-such-command",), tmp_path / "bad")]
+    with pytest.raises(typer.Exit) as caught:
+        run_steps(todo, done)
+    assert caught.value.exit_code == 2
+    assert json.loads(done.read_text())["bad"].startswith("begun ")
 
 
 def test_every_command_of_the_demo_is_public(tmp_path: Path) -> None:

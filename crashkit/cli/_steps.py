@@ -1,0 +1,158 @@
+"""Commands one after the other, as one would type them; what is done and unchanged is not done again."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from crashkit.cli._console import fail, say
+from crashkit.errors import OutputError
+from crashkit.version import __version__
+
+
+@dataclass(frozen=True)
+class Step:
+    """One command and why it is run.
+
+    Attributes
+    ----------
+    why
+        What it is for, in a line.
+    arguments
+        The command without `crashkit`.
+    result
+        The file or folder it leaves, if any; a step without is run every time.
+    depends
+        Gives a text that changes when what the command reads has changed, asked when its turn comes; without one, the
+        step is run again when one before it was.
+    again
+        Further arguments where a result of its own is there already, such as --overwrite.
+    extends
+        Says whether the same command may add to the result that is there; otherwise the old one is set aside while the
+        new one is made.
+    """
+
+    why: str
+    arguments: tuple[str, ...]
+    result: Path | None = None
+    depends: Callable[[], str] | None = None
+    again: tuple[str, ...] = ()
+    extends: Callable[[], bool] | None = None
+
+
+def run_steps(todo: Sequence[Step], done_file: Path, *, fresh: bool = False) -> None:
+    """Run the steps in order. Those that ended well last time, unchanged and with the same version, are skipped.
+
+    Results are noted in `done_file` by name. A result that is there and not noted was made by somebody else, and is
+    refused instead of being replaced.
+    """
+    noted = {name: "" if fresh else mark for name, mark in _noted(done_file).items()}
+    renewed = False
+    for number, step in enumerate(todo, 1):
+        if step.result is None:
+            _say(number, todo, step, step.arguments)
+            _run(number, step.arguments)
+            continue
+        name = step.result.name
+        mark = _mark(step)
+        there = step.result.exists()
+        if there and name not in noted:
+            raise OutputError(
+                f"{step.result}: is there, but was not made by this command; move it away, or choose another folder"
+            )
+        arguments = step.arguments + (step.again if there else ())
+        interrupted = step.result.with_name(f".{name}.training").exists() and noted.get(name) == f"begun {mark}"
+        if interrupted:
+            arguments += ("--resume",) if "--overwrite" in arguments else ("--resume", "--overwrite")
+        _say(number, todo, step, arguments)
+        if there and noted.get(name) == mark and (step.depends is not None or not renewed):
+            say("  (unchanged, done before; --fresh makes it again)")
+            continue
+        renewed = True
+        asked = f"{name}: command"
+        adds = step.extends is None or (noted.get(asked) == _command(step) and there and step.extends())
+        noted[asked] = _command(step)
+        _note(done_file, noted, name, f"begun {mark}")
+        with contextlib.nullcontext() if adds else _aside(step.result):
+            _run(number, arguments)
+        _note(done_file, noted, name, _mark(step))
+
+
+def _say(number: int, todo: Sequence[Step], step: Step, arguments: Sequence[str]) -> None:
+    say(f"\n[{number}/{len(todo)}] {step.why}\n$ crashkit {shlex.join(arguments)}")
+
+
+def _mark(step: Step) -> str:
+    """What a step's result depends on."""
+    known = [__version__, _command(step), step.depends() if step.depends is not None else ""]
+    return hashlib.sha256("\0".join(known).encode()).hexdigest()
+
+
+def _command(step: Step) -> str:
+    """The command without the folder its result lies in, and without names of this machine: a moved folder is as good."""
+    home = str(step.result.parent) + os.sep if step.result is not None else ""
+    return hashlib.sha256("\0".join(a.removeprefix(home) for a in step.arguments).encode()).hexdigest()
+
+
+@contextlib.contextmanager
+def _aside(result: Path) -> Iterator[None]:
+    """Out of the way what stands there; it comes back unless a new one takes its place."""
+    from data_schema.replace import remove
+
+    old = result.with_name(f".{result.name}.before")
+    if result.exists():
+        remove(old)
+        result.rename(old)
+    try:
+        yield
+    finally:
+        if old.exists() and not result.exists():
+            old.rename(result)
+        elif result.exists():
+            remove(old)
+
+
+def _noted(done_file: Path) -> dict[str, str]:
+    try:
+        found = json.loads(done_file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise OutputError(f"{done_file}: cannot be read ({error}); delete it and what lies beside it") from error
+    return {str(k): str(v) for k, v in found.items()} if isinstance(found, dict) else {}
+
+
+def _note(done_file: Path, noted: dict[str, str], name: str, mark: str) -> None:
+    from data_schema.replace import beside
+
+    noted[name] = mark
+    with beside(done_file) as new:
+        new.write_text(json.dumps(noted, indent=1), encoding="utf-8")
+
+
+def _run(number: int, arguments: Sequence[str]) -> None:
+    """Run a command in a process of its own. Ctrl-C reaches it, too, and it is given the time to keep what it has."""
+    home = str(Path(__file__).parents[2])
+    path = os.pathsep.join(filter(None, [home, os.environ.get("PYTHONPATH", "")]))
+    # -P: a file of the user's folder called evaluation.py or surrogates.py is not taken for a package of ours.
+    command = [sys.executable, "-P", "-m", "crashkit", *arguments]
+    interrupted = False
+    with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": path}) as process:
+        while True:
+            try:
+                code = process.wait()
+                break
+            except KeyboardInterrupt:
+                interrupted = True
+    if interrupted:
+        fail("interrupted; the same command goes on from there", code=130)
+    if code:
+        fail(f"step {number} ended with code {code}; its message stands above", code=code)
