@@ -179,7 +179,9 @@ def _only_more(data: Path, sources: Iterable[Path]) -> bool:
     from crashkit.dataset import open_dataset
 
     with open_dataset(data, chunks=None) as dataset:
-        read = Counter((str(e["file"]), int(e["bytes"])) for e in json.loads(dataset.attrs["source_files"]))
+        entries = json.loads(dataset.attrs["source_files"])
+    files = {(str(e["file"]), int(e["bytes"]), str(e["sha256"])) for e in entries}  # one may hold several runs
+    read = Counter((name, size) for name, size, _ in files)
     return not read - Counter((p.name, p.stat().st_size) for source in sources for p in _files(source))
 
 
