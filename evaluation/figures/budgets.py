@@ -67,7 +67,7 @@ class Budgets:
             min(b.own for b in self.budgets.values()) / 2, 3 * max(b.lifted for b in self.budgets.values())
         )
         few_log_ticks(predict.xaxis)
-        predict.set_xlabel("ms a state, pale: lifted")
+        predict.set_xlabel("ms per state, light: lifted")
         predict.set_title("prediction")
         predict.grid(axis="y", visible=False)
         for m, b in self.budgets.items():
@@ -79,7 +79,7 @@ class Budgets:
         trade.set_xscale("log")
         trade.margins(x=0.35, y=0.14)
         few_log_ticks(trade.xaxis)
-        trade.set_xlabel("ms a state, full mesh")
+        trade.set_xlabel("ms per state, full mesh")
         trade.set_ylabel("mean node error (cm)")
         trade.set_title("error for its price")
         sheet.legend(figure, trade)
@@ -94,13 +94,10 @@ class Budgets:
             if not any(y.lifted <= x.lifted and y.error < x.error for k, y in self.budgets.items() if k != m)
         ]  # fmt: skip
         return (
-            f"First: seconds an epoch took in training (models fitted in one go have none). Second: milliseconds "
-            f"a state "
-            f"of a whole run on the model's own mesh, and pale with lifting to the full mesh. Third: error against "
-            f"the time of a prediction on the full mesh; only {', '.join(front)} are not beaten in both at once. "
-            f"Fastest "
-            f"is {fastest} ({f.lifted:.3g} ms, {f.error * CM:.2f} cm), most accurate {best} ({b.lifted:.3g} ms, "
-            f"{b.error * CM:.2f} cm)."
+            f"First: seconds per epoch of the training (models without epochs have none). Second: milliseconds per state "
+            f"for a whole run, dark: on the model's own mesh, light: with lifting to the full mesh. Third: error against "
+            f"prediction time on the full mesh. Best trade-off (Pareto): {', '.join(front)}. Fastest: {fastest} "
+            f"({f.lifted:.3g} ms, {f.error * CM:.2f} cm); most accurate: {best} ({b.lifted:.3g} ms, {b.error * CM:.2f} cm)."
         )
 
 
@@ -131,4 +128,4 @@ def select(evaluation: Evaluation) -> Budgets | None:
     return Budgets(out)
 
 
-FIGURE = Kind("budgets", "What the models cost", select)
+FIGURE = Kind("budgets", "Training and prediction time", select)

@@ -49,7 +49,7 @@ class Floors:
     def draw(self, sheet: Sheet) -> Figure:
         figure, (left, right) = sheet.panels(2, height=max(6.8, 2.6 + 0.62 * len(self.points)))
         modes = np.arange(1, len(self.floor) + 1)
-        left.plot(modes, self.floor * CM, color=INK, linewidth=1.4, label="POD projection floor")
+        left.plot(modes, self.floor * CM, color=INK, linewidth=1.4, label="best linear compression (POD)")
         left.fill_between(modes, self.floor * CM, color="#eeeeee", zorder=0)
         for label, p in self.points.items():
             style = sheet.style(label)
@@ -92,7 +92,12 @@ class Floors:
         ax.set_yticks(at, labels)
         ax.grid(axis="y", visible=False)
         ax.set_xlabel("mean node error (cm)")
-        ax.set_title("pale: all · full: reduction · bar: lifting", color=FAINT, fontweight="normal", fontsize=8)
+        ax.set_title(
+            "light: total · dark: compression · line: interpolation error",
+            color=FAINT,
+            fontweight="normal",
+            fontsize=8,
+        )
         ax.margins(x=0.14)
 
     def caption(self) -> str:
@@ -100,19 +105,17 @@ class Floors:
         p = self.points[best]
         need = np.flatnonzero(self.floor <= p.total)
         modes = (
-            f"a projection on {need[0] + 1} mode{'s' if need[0] else ''} would be as exact"
+            f"a projection on {need[0] + 1} mode{'s' if need[0] else ''} has the same error"
             if need.size
-            else f"no projection on up to {len(self.floor)} modes would be as exact"
+            else f"a projection on {len(self.floor)} modes still has a larger error"
         )
         seeds = "; thin lines span the seeds" if any(len(q.seeds) > 1 for q in self.points.values()) else ""
         share = 100 * min(1.0, p.reduction / p.total)
         return (
-            f"First: the line is what a linear reduction of the test runs costs before any regression; a model "
-            f"above it "
-            f"loses the rest to regression, a model below it reduces better than POD with as many numbers. Second: the "
-            f"full bar is the error of encoding and decoding the truth, the pale bar the error of the prediction, the "
-            f"black mark what lifting from the coarse mesh costs even if all else were exact{seeds}. For {best}, "
-            f"{modes}, and reduction makes {share:.0f} % of the size of its error."
+            f"First: the line is the best linear compression of the test runs (POD); for a model above it the rest is "
+            f"regression, a model below it compresses better than POD with as many numbers. Second, light: total error, dark: "
+            f"compression error, line: interpolation error from the coarse mesh{seeds}. For {best}, {modes}; its compression "
+            f"error is {share:.0f} % of its total error."
         )
 
 
@@ -132,4 +135,4 @@ def select(evaluation: Evaluation) -> Floors | None:
     return Floors(evaluation.floor(), points)
 
 
-FIGURE = Kind("floors", "Reduction or regression: where the error comes from", select)
+FIGURE = Kind("floors", "Compression or regression: where the error comes from", select)

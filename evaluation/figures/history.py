@@ -65,9 +65,9 @@ class History:
         rising = [m for m in order if (total := self.curves[m]["total"]).size > 20 and _rises(total)]
         note = f" The total of {', '.join(rising)} rises again at its end." if rising else ""
         return (
-            f"Losses over the epochs: pale as they were, strong as a running median. Lowest totals: {said}. Each level "
-            f"is scaled by its own mean displacement, so heights may be compared, but only within the same "
-            f"loss. A curve that still falls at its right end asks for more epochs.{note}"
+            f"Losses over the epochs, light: raw, dark: running median. Lowest totals: {said}. Each level is scaled by its "
+            f"own mean displacement, so compare heights only within the same loss. If a curve still falls at its right end, "
+            f"more epochs would help.{note}"
         )
 
 

@@ -80,10 +80,9 @@ class ErrorOnLevels:
             for level, model in best.items()
         )
         return (
-            f"Error on the nodes of each coarse mesh, so without any upsampling: the full bar is reconstruction "
-            f"(encode and decode the truth), the pale bar the prediction from the parameters. Models of the full mesh "
-            f"are restricted to the same nodes. The dotted line is what a projection on {self.modes} modes of that "
-            f"level costs. Lowest prediction error: {winners}."
+            f"Error on the nodes of each coarse mesh, so without upsampling. Dark: compression error (encode and decode the "
+            f"true states); light: error of the prediction. Predictions of full-mesh models are taken at the same nodes. "
+            f"Dotted line: best linear compression with {self.modes} modes on that level. Lowest prediction error: {winners}."
         )
 
 

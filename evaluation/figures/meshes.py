@@ -48,9 +48,8 @@ class Meshes:
     def caption(self) -> str:
         said = ", ".join(f"{self.lifting[level.index] * CM:.2f} cm from level {level.index}" for level in self.levels)
         return (
-            f"Kept nodes on the full mesh, and the coarse mesh between them. Kept nodes stay where they were. "
-            f"Lifting the "
-            f"true motion of the test runs from them to all nodes costs {said}, whatever the model."
+            f"Kept nodes on the full mesh, and the coarse mesh between them. Kept nodes do not move. Error of interpolating "
+            f"the true motion of the test runs from them to all nodes: {said}, whatever the model."
         )
 
 

@@ -54,7 +54,7 @@ class RigidAndDeformation:
         bars.set_yticks(at, models)
         bars.grid(axis="y", visible=False)
         bars.set_xlabel("mean error (cm)")
-        bars.set_title("pale: rigid motion · full: deformation", fontweight="normal", fontsize=8, color=FAINT)
+        bars.set_title("light: rigid motion · dark: deformation", fontweight="normal", fontsize=8, color=FAINT)
         bars.margins(x=0.16)
         over_time.fill_between(
             self.time * MS, self.true_deformation * CM, color="#eeeeee", label="true deformation", linewidth=0
@@ -76,16 +76,14 @@ class RigidAndDeformation:
         best = min(crush, key=lambda m: crush[m])
         size, moved = float(masked_mean(self.true_deformation)), float(masked_mean(self.true_rigid))
         worse = [m for m, e in crush.items() if size > 0 and e >= size]
-        warning = f" {', '.join(worse)} would do no worse on the crush by predicting none at all." if worse else ""
+        warning = (
+            f" {', '.join(worse)}: the error is not smaller than that of predicting no deformation." if worse else ""
+        )
         return (
-            f"Each state is split into the best-fitting rigid motion of the whole structure, on average "
-            f"{moved * CM:.1f} cm, and the "
-            f"deformation seen by somebody who moves with it, {size * CM:.1f} cm. First: the errors in both. "
-            f"Second: the error in the "
-            f"deformation alone over time, on the grey ground of its true size; lines that touch the ground's "
-            f"edge predict "
-            f"no crush. Lowest in deformation: {best}, which misses "
-            f"{100 * crush[best] / size if size > 0 else 0:.0f} % of it.{warning}"
+            f"Each state is split into the best-fitting rigid motion of the whole structure (mean {moved * CM:.1f} cm) and "
+            f"the deformation (mean {size * CM:.1f} cm). First: the errors of both. Second: error of the deformation over "
+            f"time; grey: size of the true deformation, which is also the error of predicting none. Lowest in deformation: "
+            f"{best}, with an error of {100 * crush[best] / size if size > 0 else 0:.0f} % of the deformation.{warning}"
         )
 
 
@@ -102,4 +100,4 @@ def select(evaluation: Evaluation) -> RigidAndDeformation | None:
     )
 
 
-FIGURE = Kind("rigid", "Rigid motion and deformation apart", select)
+FIGURE = Kind("rigid", "Rigid motion and deformation", select)

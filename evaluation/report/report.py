@@ -32,13 +32,13 @@ from evaluation.report.verdict import RULES, statements
 _HEADINGS = {
     "model": "model", "nodes": "nodes", "error_cm": "mean node error (cm)", "spread_cm": "± over seeds (cm)",
     "relative_percent": "relative (%)", "worst_run_cm": "worst run (cm)", "peak_cm": "largest anywhere (cm)",
-    "reduction_cm": "reduction alone (cm)", "pod_floor_cm": "POD floor, same size (cm)", "latent": "latent size",
-    "parameters": "parameters", "training_s": "training (s)", "prediction_lifted_ms": "ms a state",
+    "reduction_cm": "compression error (cm)", "pod_floor_cm": "best linear compression, same size (cm)", "latent": "latent size",
+    "parameters": "parameters", "training_s": "training (s)", "prediction_lifted_ms": "ms per state",
 }  # fmt: skip
 _FURTHER_HEADINGS = {
-    "model": "model", "level": "level", "seeds": "seeds", "worst_run": "worst run", "lifting_cm": "lifting alone (cm)",
-    "seconds_per_epoch": "s an epoch", "prediction_ms": "ms a state, own level",
-    "prediction_lifted_ms": "ms a state, full mesh", "single_prediction_ms": "ms for one state alone, full mesh",
+    "model": "model", "level": "level", "seeds": "seeds", "worst_run": "worst run", "lifting_cm": "interpolation error (cm)",
+    "seconds_per_epoch": "s per epoch", "prediction_ms": "ms per state, own level",
+    "prediction_lifted_ms": "ms per state, full mesh", "single_prediction_ms": "ms for a single state, full mesh",
     "covered_percent": "within the 90 % band (%)",
 }  # fmt: skip
 _LOWEST = (
@@ -50,14 +50,15 @@ _TEXT = (
     "The mean node error e2 is the Euclidean distance between the node of the solver's run and the predicted node, "
     "averaged over nodes, then over time, then over the test runs, each run and each state counting the same. It is "
     "an error of displacements, in centimetres, on the full mesh: predictions on a coarse mesh are lifted to it with "
-    "the static barycentric upsampling, the same for every model. Nodes whose elements have all failed take no part.",
+    "the static barycentric upsampling, the same for every model. Nodes without a living element are left out.",
     "The relative error is the L2 norm of the displacement error over all nodes and states of a run, divided by "
     "that of "
     "the displacement, and averaged over the runs; it does not depend on where the origin lies. "
-    "The POD floor is the error of projecting the test runs themselves on the leading modes of all other runs, not "
-    "centred: what a linear reduction to as many numbers costs before any regression.",
-    "A band says how far a node may lie from its prediction, from the errors on validation runs: 90 % of nodes and "
-    "states are to lie within. The table has the share that really does on the test runs.",
+    "The compression error is the error of encoding and decoding the true states. The best linear compression (POD "
+    "floor) is the error of projecting the test runs on the leading modes of all other runs, not centred. The "
+    "interpolation error is the error of interpolating the true states back from the nodes of a coarse mesh.",
+    "A band is an interval around the prediction that should contain 90 % of nodes and states; its width comes from "
+    "the errors on validation runs. The table lists the share of the test runs' nodes and states within it.",
     "Milliseconds are the fastest of nine repetitions on the machine named below, for all states of a run asked "
     "in one call "
     "and divided by their number, unless a column says otherwise.",
@@ -183,7 +184,7 @@ def _subtitle(evaluation: Evaluation) -> str:
 def _key_table(performance: Columns) -> ShownTable:
     several = any(v == v for v in performance["spread_cm"])
     headings = {k: v for k, v in _HEADINGS.items() if several or k != "spread_cm"}
-    note = "Lengths on the full mesh. The best of a column is set in bold; explanations stand under Methods."
+    note = "Lengths on the full mesh. The best of a column is set in bold; explanations are under Methods."
     return show_table("Performance", performance, note, headings, _LOWEST)
 
 

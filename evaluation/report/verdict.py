@@ -19,19 +19,20 @@ from evaluation.measures.distance import masked_mean
 
 FEW_RUNS = 10  # fewer test runs than this carry no reliable ranking of close models
 NEAR = 1.25  # "nearly as exact": at most a quarter worse than the best
-START_SHARE = 0.1  # of the mean error: more than this in the first state, where nothing has moved, is called out
-POOR_RELATIVE = 0.15  # a relative displacement error above this is called out
+# Share of the mean error: a larger displacement in the first state, where nothing has moved, gives a warning.
+START_SHARE = 0.1
+POOR_RELATIVE = 0.15  # a relative displacement error above this gives a warning
 
 RULES = (
-    f"Two models are told apart only if the 95 % interval of the mean difference of their errors over the test runs "
-    f"and the seeds of training (paired bootstrap, 4000 resamples, fixed seed) leaves zero out. "
+    f"Two models are called different only if the 95 % interval of the mean difference of their errors over the test "
+    f"runs and the training seeds (paired bootstrap, 4000 resamples, fixed seed) does not contain zero. "
     f"Most accurate: lowest mean node error on the full mesh. "
     f"Many queries: the fastest on the full mesh among those at most {100 * (NEAR - 1):.0f} % worse than the best, "
     f"none where their relative displacement error is above {100 * POOR_RELATIVE:.0f} %. "
     f"Visualisation: among models that predict on a coarse mesh, the one with the fewest nodes at most "
     f"{100 * (NEAR - 1):.0f} % worse than the best of these. "
     f"Worst case: lowest error on its worst test run. "
-    f"A warning stands wherever there are fewer than {FEW_RUNS} test runs, a relative displacement error above "
+    f"A warning is given for fewer than {FEW_RUNS} test runs, a relative displacement error above "
     f"{100 * POOR_RELATIVE:.0f} %, a group of nodes whose error exceeds half of its own motion, a finer level that is "
     f"not better than the coarser one, a baseline that is better than a multi-hierarchical model, test runs outside "
     f"the range of the training runs, models trained once, or a model that moves nodes in the first state by more than "
@@ -108,6 +109,10 @@ def _listed(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
+def _is(names: Sequence[str]) -> str:
+    return "is" if len(names) == 1 else "are"
+
+
 def _use(evaluation: Evaluation) -> list[Statement]:
     ranked = evaluation.ranked
     best = ranked[0]
@@ -121,7 +126,9 @@ def _use(evaluation: Evaluation) -> list[Statement]:
     if len(ranked) == 1:
         text += ". There is no other model to compare it with."
     elif equal:
-        text += f". {_listed(equal)} cannot be told apart from it on these {len(evaluation.runs)} test runs."
+        text += (
+            f". On these {len(evaluation.runs)} test runs, {_listed(equal)} {_is(equal)} not significantly different."
+        )
     else:
         text += f", ahead of {ranked[1].label} with {_cm(_error(evaluation, ranked[1]))}."
     out = [Statement("use", "Highest accuracy", text)]
@@ -182,21 +189,25 @@ def _error_source(evaluation: Evaluation) -> list[Statement]:
     latent = evaluation.predictor(best).n_latent
     floor = evaluation.floor_at(latent)
     source = (
-        "Regression dominates: more runs or a better regression would help, more latent numbers hardly."
+        "Most of it is regression: more runs or a better regression would help, a larger latent size would not."
         if s.reduction < 0.5 * s.mean
         else (
-            "Reduction dominates: a larger latent space or a better reduction would help."
+            "Most of it is compression: a larger latent size or a better reduction would help."
             if s.reduction > 0.8 * s.mean
-            else "Reduction and regression both matter."
+            else "Compression and regression both matter."
         )
     )
-    beside = f" A POD projection on {latent} modes costs {_cm(floor)}." if floor == floor else ""
+    beside = (
+        f" The best linear compression to {latent} numbers (POD) has an error of {_cm(floor)}."
+        if floor == floor
+        else ""
+    )
     return [
         Statement(
             "finding",
             "Where the error comes from",
-            f"Of the {_cm(s.mean)} of {best.label}, {_cm(s.reduction)} remain when the truth itself is encoded and "
-            f"decoded.{beside} {source}",
+            f"The error of {best.label} is {_cm(s.mean)}; its compression error (encoding and decoding the true states) "
+            f"is {_cm(s.reduction)}.{beside} {source}",
         )
     ]
 
@@ -218,17 +229,21 @@ def _families(evaluation: Evaluation) -> list[Statement]:
     interval = f" (difference {delta * CM:+.2f} cm, {spread})" if count > 1 else ""
     about = "Multi-hierarchical against the best baseline"
     if high < 0:
-        return [Statement("finding", about, f"{ours.label} beats {rival.label}: {numbers}{interval}.")]
+        return [Statement("finding", about, f"{ours.label} is better than {rival.label}: {numbers}{interval}.")]
     if low > 0:
         return [
             Statement(
                 "warning",
                 about,
-                f"{ours.label}, the best multi-hierarchical level, loses to {rival.label}: {numbers}{interval}. For "
+                f"{ours.label}, the best multi-hierarchical level, is worse than {rival.label}: {numbers}{interval}. For "
                 f"accuracy on the full mesh, {rival.label} is the better choice here.",
             )
         ]
-    return [Statement("finding", about, f"{ours.label} and {rival.label} cannot be told apart: {numbers}{interval}.")]
+    return [
+        Statement(
+            "finding", about, f"{ours.label} and {rival.label} are not significantly different: {numbers}{interval}."
+        )
+    ]
 
 
 def _levels(evaluation: Evaluation) -> list[Statement]:
@@ -247,9 +262,11 @@ def _levels(evaluation: Evaluation) -> list[Statement]:
             if b >= a
         ]
         if worse:
-            out.append(Statement("warning", "Levels", f"{said}: {_listed(worse)}. Refinement did not pay there."))
+            out.append(
+                Statement("warning", "Levels", f"{said}: {_listed(worse)}. The finer levels did not reduce the error.")
+            )
         else:
-            out.append(Statement("finding", "Levels", f"The error falls with every refinement: {said}."))
+            out.append(Statement("finding", "Levels", f"The error decreases with every finer level: {said}."))
     return out
 
 
@@ -261,8 +278,7 @@ def _warnings(evaluation: Evaluation) -> list[Statement]:
             Statement(
                 "warning",
                 "One test run",
-                "All numbers come from a single test run. They describe this run and say nothing about the next one; "
-                "no ranking of models should be built on them.",
+                "All numbers come from a single test run and say nothing about other runs. Do not rank models by them.",
             )
         )
     elif count < FEW_RUNS:
@@ -270,20 +286,20 @@ def _warnings(evaluation: Evaluation) -> list[Statement]:
             Statement(
                 "warning",
                 "Few test runs",
-                f"There are {count} test runs. Differences smaller than the spread between runs mean little.",
+                f"There are {count} test runs. Differences smaller than the spread between runs are not reliable.",
             )
         )
     once = [e.label for e in evaluation.leaders if len(e.keys) == 1]
     if len(once) < len(evaluation.leaders) and once:
-        text = f"Trained once, so without a spread: {_listed(once)}. How much of their rank is luck is not known."
-        out.append(Statement("warning", "One seed alone", text))
+        text = f"Trained once, so without a spread: {_listed(once)}. How much their results depend on the seed is not known."
+        out.append(Statement("warning", "Models with one seed", text))
     if len(once) == len(evaluation.leaders):
         out.append(
             Statement(
                 "warning",
                 "One seed each",
-                "Every model was trained once. Another seed gives another number; train with several seeds to see how "
-                "much of a difference is luck.",
+                "Every model was trained with one seed. Another seed gives other numbers; train with several seeds to see "
+                "how much.",
             )
         )
     poor = [
@@ -323,7 +339,7 @@ def _warnings(evaluation: Evaluation) -> list[Statement]:
                 "An outlier",
                 f"On {called(evaluation.test_names[run])} the error of {best.label} is "
                 f"{worst.max() / np.median(worst):.1f} times "
-                f"that of a typical run; look at its place in the design space below.",
+                f"the median; see where it lies in the design space below.",
             )
         )
     return out
@@ -340,8 +356,8 @@ def _start(evaluation: Evaluation) -> list[Statement]:
     ]
     if not moved:
         return []
-    text = f"In the first state nothing has moved, yet on average {_listed(moved)} are predicted there."
-    return [Statement("warning", "A motion before the crash", text)]
+    text = f"In the first state nothing has moved, but the mean predicted displacement is not zero: {_listed(moved)}."
+    return [Statement("warning", "Non-zero prediction at t = 0", text)]
 
 
 def _outside(evaluation: Evaluation) -> list[Statement]:
