@@ -19,7 +19,7 @@ from surrogates.operators.convolutions import exportable
 from surrogates.physics.registration import Registration
 from surrogates.record import Fit, Record
 from surrogates.settings import Settings
-from surrogates.uncertainty import Band
+from surrogates.uncertainty import Band, Beliefs
 
 # Samples predicted at once.
 _CHUNK = 512
@@ -120,27 +120,42 @@ class Surrogate:
         return torch.cat([part.transpose(0, 1) for part in parts]).contiguous().numpy()
 
     def has_band(self, level: int | None = None) -> bool:
-        """Whether enough validation runs were held out for `band` on the full mesh."""
+        """Whether there were runs enough for `band` on the full mesh."""
         number = self.number(level)
         return (number, number > 0) in self.bands
 
     def band(
-        self, coverage: float = 0.9, time: ArrayLike | None = None, level: int | None = None, *, full: bool = False
+        self,
+        coverage: float = 0.9,
+        time: ArrayLike | None = None,
+        level: int | None = None,
+        *,
+        full: bool = False,
+        parameters: ArrayLike | None = None,
     ) -> NDArray[np.float32]:
         """How far, m, the true node may lie from the predicted one: (state, node of `level` or of the full mesh).
 
-        The share `coverage` of nodes and states of a new run lies within it, as far as the validation runs tell; see
-        `surrogates.uncertainty`. Raises SurrogateError where no validation runs were held out.
+        The share `coverage` of nodes and states of a new run lies within it, as far as the runs tell that were left out;
+        see `surrogates.uncertainty`. With `parameters` (parameter,) it is the band of that run, wider where the model
+        itself knows less; without, that of a typical run. Raises SurrogateError where there were too few runs.
         """
         number = self.number(level)
         found = self.bands.get((number, full and number > 0))
         if found is None:
             raise SurrogateError(
-                f"there is no band for {level_name(self.settings, number)}: too few validation runs were held out; see the model card"
+                f"there is no band for {level_name(self.settings, number)}: too few runs to judge it by; see the model card"
             )
-        return found.half_width(
-            coverage, self.record.time if time is None else np.atleast_1d(np.asarray(time, np.float64))
-        )
+        times = self.record.time if time is None else np.atleast_1d(np.asarray(time, np.float64))
+        if parameters is None:
+            return found.half_width(coverage, times)
+        values, times = self.checked(parameters, times)
+        return found.half_width(coverage, times, self.beliefs(values))
+
+    def beliefs(self, parameters: NDArray[np.float64]) -> Beliefs:
+        """What the model says of runs (run, parameter) before they are computed: their size, and its own deviation."""
+        core = self.core
+        said = core.deviation(self.registration.read(parameters)) if isinstance(core, PodRegression) else None
+        return Beliefs(self.registration.clock.size(parameters), np.ones(len(parameters)) if said is None else said)
 
     def sensitivity(
         self,

@@ -1,37 +1,61 @@
-"""How far a prediction may be wrong, and how it moves with the parameters.
+"""How far a prediction may be wrong.
 
-The band is conformal: its width comes from what the validation runs showed, not from a belief. The distance between
-true and predicted node is divided by a scale, a product of one number for the node and one for the state, estimated on
-the other validation runs; the band is the scale times the quantile of these ratios, all runs pooled (Dunn, Wasserman,
-Ramdas 2022, doi 10.1080/01621459.2022.2060112, "pooling CDFs": the nominal share of nodes and states of a new run lies
-inside, on average, as the number of validation runs grows).
+The band is conformal: its width comes from the errors on runs that a model had not seen, not from a belief. These are
+validation runs, or all training runs, each predicted by the folds it was left out of (CV+: Barber, Candes, Ramdas,
+Tibshirani 2021, doi 10.1214/20-AOS1965; here the prediction is that of the model fitted to all runs). The distance
+between true and predicted node is divided by a scale, a product of one number for the node, one for the state and one
+for the run, the first two estimated on the other runs; the band is the scale times the quantile of these ratios, all
+runs pooled (Dunn, Wasserman, Ramdas 2022, doi 10.1080/01621459.2022.2060112, "pooling CDFs": the nominal share of nodes
+and states of a new run lies inside, on average, as the number of runs grows). The number for the run is what the model
+itself says of a query before it is computed: its size against the reference's, and what the process believes its own
+error to be. The belief enters with its root: whole, it makes the band too narrow for fast runs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from surrogates.errors import SurrogateError
 
-if TYPE_CHECKING:
-    pass
-
 # Fewer validation runs than this leave no other run to estimate the scale on.
 FEWEST_RUNS = 2
+# Fewer training runs than this give no band by cross-validation: a tenth of them is less than one run.
+FEWEST_BY_FOLDS = 8
 # Shares for which the ratios' quantiles are kept; between them they are interpolated.
 SHARES = np.round(np.arange(0.50, 0.995, 0.01), 2)
 # Nodes whose ratios are pooled; more change no quantile.
 _POOLED = 2000
+# The share by which kinds of spread are compared.
+_COMPARED = 0.9
+
+Spread = Literal["constant", "size", "deviation"]
+# Means (run, node) and (run, state), and the distances (state, some nodes) of each run.
+Gathered = tuple[NDArray[np.float64], NDArray[np.float64], list[NDArray[np.float32]]]
+_SPREADS: tuple[Spread, ...] = ("constant", "size", "deviation")
+
+
+@dataclass(frozen=True)
+class Beliefs:
+    """What a model says of runs before they are computed: sizes (run,), and deviations (run,) up to a factor."""
+
+    size: NDArray[np.float64]
+    deviation: NDArray[np.float64]
+
+    def spread(self, kind: Spread) -> NDArray[np.float64]:
+        """(run,): how wide the band of each run is, up to a factor."""
+        if kind == "constant":
+            return np.ones(len(self.size))
+        return self.size if kind == "size" else self.size * np.sqrt(self.deviation)
 
 
 @dataclass(frozen=True)
 class Band:
-    """Half-widths: at node i and state t the true node lies within `factor * node[i] * state[t]` of the predicted one.
+    """Half-widths: at node i and state t the true node lies within `factor * node[i] * state[t] * run` of the predicted one.
 
     Attributes
     ----------
@@ -40,7 +64,9 @@ class Band:
     factor
         (share,) for the shares SHARES.
     runs
-        Validation runs behind it.
+        Runs behind it.
+    spread, unit
+        What the width of a run follows: nothing, its size, or size and deviation; and the value for which `run` is 1.
     """
 
     node: NDArray[np.float32]
@@ -48,9 +74,15 @@ class Band:
     time: NDArray[np.float64]
     factor: NDArray[np.float64]
     runs: int
+    spread: Spread = "constant"
+    unit: float = 1.0
 
-    def half_width(self, coverage: float, time: NDArray[np.float64]) -> NDArray[np.float32]:
+    def half_width(
+        self, coverage: float, time: NDArray[np.float64], beliefs: Beliefs | None = None
+    ) -> NDArray[np.float32]:
         """(state, node), m, for the share `coverage` of nodes and states; between states it is interpolated.
+
+        beliefs  of one run; without, the band of a typical run
 
         Raises
         ------
@@ -60,25 +92,82 @@ class Band:
         if not SHARES[0] <= coverage <= SHARES[-1]:
             raise SurrogateError(f"coverage {coverage} was asked for; expected {SHARES[0]:g} to {SHARES[-1]:g}")
         factor = np.interp(coverage, SHARES, self.factor)
+        if beliefs is not None:
+            factor = factor * float(beliefs.spread(self.spread)[0]) / self.unit
         state = np.interp(time, self.time, self.state)
         return (factor * state[:, None] * self.node[None]).astype(np.float32)
 
 
-def calibrate(distances: Sequence[NDArray[np.float32]], time: NDArray[np.float64]) -> Band:
-    """The band of distances (state, node), m, between truth and prediction, one array for each validation run."""
-    if len(distances) < FEWEST_RUNS:
-        raise SurrogateError(f"a band needs at least {FEWEST_RUNS} validation runs; found {len(distances)}")
-    by_node = np.stack([d.mean(axis=0, dtype=np.float64) for d in distances])
-    by_state = np.stack([d.mean(axis=1, dtype=np.float64) for d in distances])
+def calibrate(
+    distances: Iterable[NDArray[np.float32]],
+    time: NDArray[np.float64],
+    beliefs: Beliefs | None = None,
+    runs: NDArray[np.int64] | None = None,
+) -> Band:
+    """The band of distances (state, node), m, between truth and prediction, one array for each run that was not seen.
+
+    beliefs  of each array; the kind of spread that makes the band of nine tenths narrowest is taken
+    runs     which run each array is of, where some come more than once; a run never judges itself
+    """
+    return calibrate_gathered(gather(distances), time, beliefs, runs)
+
+
+def calibrate_gathered(
+    gathered: Gathered,
+    time: NDArray[np.float64],
+    beliefs: Beliefs | None = None,
+    runs: NDArray[np.int64] | None = None,
+) -> Band:
+    """As `calibrate`, of what is left of the distances."""
+    by_node, by_state, pooled = gathered
+    count = len(pooled)
+    which = np.arange(count) if runs is None else runs
+    if len(np.unique(which)) < FEWEST_RUNS:
+        raise SurrogateError(f"a band needs at least {FEWEST_RUNS} validation runs; found {len(np.unique(which))}")
+    found = []
+    for kind in _SPREADS[:1] if beliefs is None else _SPREADS:
+        spread = np.ones(count) if beliefs is None else beliefs.spread(kind)
+        unit = float(np.sqrt(np.square(spread).mean()))
+        share = spread / unit
+        node, state, factor = _product(by_node / share[:, None], by_state / share[:, None], pooled, share, which)
+        band = Band(
+            node.astype(np.float32), state.astype(np.float32), np.asarray(time, np.float64), factor,
+            len(np.unique(which)), kind, unit,
+        )  # fmt: skip
+        width = np.interp(_COMPARED, SHARES, factor) * float(node.mean() * state.mean() * share.mean())
+        found.append((width, band))
+    return min(found, key=lambda pair: pair[0])[1]
+
+
+def gather(distances: Iterable[NDArray[np.float32]]) -> Gathered:
+    """Means (run, node) and (run, state), and the distances (state, some nodes) of each run."""
+    by_node, by_state, pooled = [], [], []
+    for distance in distances:
+        by_node.append(distance.mean(axis=0, dtype=np.float64))
+        by_state.append(distance.mean(axis=1, dtype=np.float64))
+        some = np.unique(np.linspace(0, distance.shape[1] - 1, _POOLED).astype(int))
+        pooled.append(distance[:, some])
+    if not pooled:
+        return np.zeros((0, 1)), np.zeros((0, 1)), []
+    return np.stack(by_node), np.stack(by_state), pooled
+
+
+def _product(
+    by_node: NDArray[np.float64],
+    by_state: NDArray[np.float64],
+    pooled: list[NDArray[np.float32]],
+    share: NDArray[np.float64],
+    which: NDArray[np.int64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Factors of node and state, and the quantiles of the ratios to them; each run is judged by the others."""
     some = np.unique(np.linspace(0, by_node.shape[1] - 1, _POOLED).astype(int))
     ratios = []
-    for k, distance in enumerate(distances):
-        others = np.arange(len(distances)) != k
+    for k, distance in enumerate(pooled):
+        others = which != which[k]
         node, state = _scale(by_node[others], by_state[others])
-        ratios.append((distance[:, some] / (state[:, None] * node[some])).ravel())
+        ratios.append((distance / (share[k] * state[:, None] * node[some])).ravel())
     factor = np.quantile(np.concatenate(ratios), SHARES)
-    node, state = _scale(by_node, by_state)
-    return Band(node.astype(np.float32), state.astype(np.float32), np.asarray(time, np.float64), factor, len(distances))
+    return (*_scale(by_node, by_state), factor)
 
 
 def coverage(distances: NDArray[np.float32], half_width: NDArray[np.float32]) -> float:

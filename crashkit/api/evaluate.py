@@ -236,9 +236,12 @@ class StoredLevel:
     def reconstruct(self, displacement: NDArray[np.float32]) -> NDArray[np.float32]:
         return self.surrogate.reconstruct(displacement, self.level)
 
-    def half_width(self, share: float, time: NDArray[np.float64]) -> NDArray[np.float32] | None:
+    def half_width(
+        self, share: float, time: NDArray[np.float64], parameters: NDArray[np.float64]
+    ) -> NDArray[np.float32] | None:
         known = self.surrogate.has_band(self.level)
-        return self.surrogate.band(share, time, self.level, full=True) if known else None
+        at = parameters[list(self.order)]
+        return self.surrogate.band(share, time, self.level, full=True, parameters=at) if known else None
 
 
 def as_model(surrogate: Surrogate, folder: Path, reference: Reference) -> Model:

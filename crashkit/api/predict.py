@@ -179,7 +179,8 @@ def further_arrays(
     number, full = surrogate.level_names[run.attrs["model"]], run.attrs["level"] == 0
     out: dict[str, tuple[NDArray[np.float32], str]] = {}
     if band is not None:
-        out["half_width"] = (surrogate.band(band, run["time"].values, number, full=full), "m")
+        at = [float(run[name]) for name in surrogate.record.ranges.names]
+        out["half_width"] = (surrogate.band(band, run["time"].values, number, full=full, parameters=at), "m")
     if sensitivity:
         ranges = surrogate.record.ranges
         at = [float(run[name]) for name in ranges.names]

@@ -58,8 +58,10 @@ NOMINAL = 0.9
 class Banded(Protocol):
     """A predictor that also says how far it may be wrong."""
 
-    def half_width(self, share: float, time: NDArray[np.float64]) -> NDArray[np.float32] | None:
-        """(state, node of the full mesh), m: that share of nodes and states lies within; None where it cannot say."""
+    def half_width(
+        self, share: float, time: NDArray[np.float64], parameters: NDArray[np.float64]
+    ) -> NDArray[np.float32] | None:
+        """(state, node of the full mesh), m: that share of nodes and states of the run lies within; None where it cannot say."""
 
 
 @dataclass(frozen=True)

@@ -182,7 +182,7 @@ def _score(
         field = predictor.predict(reference.parameters[run], reference.time[states])
         prediction = full_field(reference, predictor, field, count)
         asked.add(truth[states], prediction)
-        within.append(_within(predictor, reference.time[states], truth[states], prediction))
+        within.append(_within(predictor, reference.parameters[run], reference.time[states], truth[states], prediction))
         parted.append(part_error(reference, run, truth[states], prediction))
         if sensors is not None:
             watched.append(watch(reference, sensors, run, prediction))
@@ -206,10 +206,14 @@ def _score(
 
 
 def _within(
-    predictor: Predictor, time: NDArray[np.float64], truth: NDArray[np.float32], prediction: NDArray[np.float32]
+    predictor: Predictor,
+    parameters: NDArray[np.float64],
+    time: NDArray[np.float64],
+    truth: NDArray[np.float32],
+    prediction: NDArray[np.float32],
 ) -> NDArray[np.bool_]:
     """(n,) whether each node and state that is there lies within the predictor's band; empty where it gives none."""
-    width = predictor.half_width(NOMINAL, time) if isinstance(predictor, Banded) else None
+    width = predictor.half_width(NOMINAL, time, parameters) if isinstance(predictor, Banded) else None
     if width is None:
         return np.zeros(0, bool)
     distance = node_distance(truth, prediction)

@@ -113,7 +113,7 @@ def _physics(surrogate: Surrogate) -> list[str]:
 
 def _bands(surrogate: Surrogate) -> list[str]:
     if not surrogate.bands:
-        return ["There is no band around predictions: that takes at least two validation runs."]
+        return ["There is no band around predictions: there were too few runs to judge it by (see the notes)."]
     rows = []
     for name, number in surrogate.level_names.items():
         for (k, lifted), band in surrogate.bands.items():
@@ -127,9 +127,10 @@ def _bands(surrogate: Surrogate) -> list[str]:
                     )
                 )
     return [
-        "Band that holds nine of ten true nodes around the predicted ones, calibrated on the validation runs:",
+        "Band that holds nine of ten true nodes around the predicted ones, calibrated on runs the model had not seen; wider where",
+        "the model itself knows less (`half_width` of `crashkit predict --band`). Of a typical run:",
         "",
-        *_table(("prediction", "mean half-width (cm)", "validation runs"), rows),
+        *_table(("prediction", "mean half-width (cm)", "runs"), rows),
     ]
 
 

@@ -42,10 +42,11 @@ from surrogates.record import Record, record_as_dict, record_from_dict
 from surrogates.settings import Settings, parse
 from surrogates.storage.card import card
 from surrogates.surrogate import Surrogate
-from surrogates.uncertainty import Band
+from surrogates.uncertainty import Band, Spread
 
 FORMAT = 2
 _MAIN = "model.json"
+_SPREADS: tuple[Spread, ...] = ("constant", "size", "deviation")
 _LABELS = ("node_id", "face_part", "part_id", "face_id")
 
 
@@ -242,6 +243,8 @@ def _band_tensors(surrogate: Surrogate) -> dict[str, Tensor]:
         prefix = f"{number}.{'full' if lifted else 'own'}."
         out |= {prefix + k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in arrays.items()}
         out[prefix + "runs"] = torch.tensor([band.runs])
+        out[prefix + "spread"] = torch.tensor([_SPREADS.index(band.spread)])
+        out[prefix + "unit"] = torch.tensor([band.unit], dtype=torch.float64)
     return out
 
 
@@ -251,7 +254,10 @@ def _bands(tensors: Mapping[str, Tensor], record: Record) -> dict[tuple[int, boo
         number, where, name = key.split(".")
         if name == "runs":
             parts = {n: tensors[f"{number}.{where}.{n}"].numpy() for n in ("node", "state", "factor")}
-            out[int(number), where == "full"] = Band(**parts, time=record.time, runs=int(tensors[key][0]))
+            spread = _SPREADS[int(tensors[f"{number}.{where}.spread"][0])]
+            unit = float(tensors[f"{number}.{where}.unit"][0])
+            runs = int(tensors[key][0])
+            out[int(number), where == "full"] = Band(**parts, time=record.time, runs=runs, spread=spread, unit=unit)
     return out
 
 

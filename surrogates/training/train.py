@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from surrogates.data.inputs import InputScaling, Ranges
 from surrogates.data.samples import LevelRuns, Notes, check, everything, split
 from surrogates.errors import SurrogateError
 from surrogates.models.cascade import Cascade
-from surrogates.models.pod_regression import fit_pod_regression
+from surrogates.models.pod_regression import PodFit, fit_pod_regression
 from surrogates.models.unified import Unified
 from surrogates.record import Fit, Record
 from surrogates.settings import Settings
@@ -22,7 +22,7 @@ from surrogates.surrogate import Surrogate
 from surrogates.training.loop import Diverged, Epoch, Keeper, device_of
 from surrogates.training.refinement import Refined
 from surrogates.training.trainer import Trainer
-from surrogates.uncertainty import FEWEST_RUNS, calibrate
+from surrogates.uncertainty import FEWEST_BY_FOLDS, FEWEST_RUNS, Beliefs, calibrate, calibrate_gathered, gather
 
 # Bytes of one run on the full mesh up to which lifted predictions are judged.
 _LARGEST_RUN = 2 << 30
@@ -90,14 +90,39 @@ def _fit_regression(surrogate: Surrogate, trainer: Trainer) -> None:
     surrogate.core, surrogate.registration = found.core, found.registration
     record.choice = {"inputs": found.choice.inputs, "modes": found.choice.modes}
     record.physics = {**found.registration.told(), "errors": found.worth.errors}
-    field = trainer.runs(0, surrogate.graphs)
-    distances = []
-    for held in found.held():
-        distances.append(_distance(held.predicted, field.read(runs[held.run])))
-        record.left_out[record.fitted_runs[held.run]] = (float(distances[-1].mean()), held.deviation)
-    _note(surrogate, next(iter(surrogate.level_names)), 0, distances, [])
+    _judge_by_folds(surrogate, trainer, found)
     record.errors |= found.choice.errors
     record.fits[0] = Fit(seconds=time.perf_counter() - started)
+
+
+def _judge_by_folds(surrogate: Surrogate, trainer: Trainer, found: PodFit) -> None:
+    """Note e2 (m) over the left-out runs, and calibrate the band on them where there are enough."""
+    runs, record = trainer.split.training, surrogate.record
+    field = trainer.runs(0, surrogate.graphs)
+    places: list[int] = []
+    deviations: list[float] = []
+    errors: list[float] = []
+
+    def distances() -> Iterator[NDArray[np.float32]]:
+        for held in found.held():
+            places.append(held.run)
+            deviations.append(held.deviation)
+            distance = _distance(held.predicted, field.read(runs[held.run]))
+            errors.append(float(distance.mean()))
+            yield distance
+
+    gathered = gather(distances())
+    if errors:
+        record.errors[next(iter(surrogate.level_names))] = float(np.mean(errors))
+    if len(set(places)) < FEWEST_BY_FOLDS:
+        trainer.notes.add(
+            f"there is no band: it takes {FEWEST_BY_FOLDS} training runs, and there are {len(set(places))}"
+        )
+        return
+    sizes = found.registration.clock.size(trainer.campaign.parameters[runs[places]])
+    surrogate.bands[0, False] = calibrate_gathered(
+        gathered, record.time, Beliefs(sizes, np.array(deviations)), np.array(places)
+    )
 
 
 def _fit_unified(surrogate: Surrogate, trainer: Trainer) -> None:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from surrogates.errors import SurrogateError
-from surrogates.uncertainty import SHARES, Band, calibrate, coverage
+from surrogates.uncertainty import SHARES, Band, Beliefs, calibrate, coverage
 
 TIME = np.linspace(0.0, 0.02, 11)
 
@@ -145,3 +145,38 @@ def test_of_many_nodes_some_spread_over_all_are_pooled_and_change_nothing() -> N
 def test_coverage_counts_what_lies_on_the_edge_of_the_band_as_inside() -> None:
     width = np.array([[1.0, 2.0]], np.float32)
     assert coverage(np.array([[[1.0, 2.1]], [[0.5, 2.0]]], np.float32), width) == 0.75
+
+
+def test_runs_that_the_model_knows_to_be_harder_get_wider_bands_and_the_promise_holds_for_each_kind() -> None:
+    random = np.random.default_rng(12)
+
+    def runs(count: int) -> tuple[list[np.ndarray], Beliefs]:
+        size, deviation = random.uniform(0.3, 3.0, count), random.uniform(0.5, 2.0, count)
+        scale = size * np.sqrt(deviation)
+        return [s * d for s, d in zip(scale, distances(count, seed=13), strict=True)], Beliefs(size, deviation)
+
+    band = calibrate(*(lambda pair: (pair[0], TIME, pair[1]))(runs(30)))
+    assert band.spread == "deviation"
+    others, beliefs = runs(60)
+    held = [
+        coverage(d[None], band.half_width(0.9, TIME, Beliefs(beliefs.size[[k]], beliefs.deviation[[k]])))
+        for k, d in enumerate(others)
+    ]
+    order = np.argsort(beliefs.size)
+    assert np.mean(held) == pytest.approx(0.9, abs=0.03)
+    assert min(np.mean(np.array(held)[third]) for third in np.array_split(order, 3)) > 0.85
+
+
+def test_beliefs_that_say_nothing_leave_the_band_as_it_is() -> None:
+    random = np.random.default_rng(14)
+    nothing = Beliefs(np.exp(random.normal(0, 1, 12)), np.exp(random.normal(0, 1, 12)))
+    band = calibrate(distances(12, seed=1), TIME, nothing)
+    assert band.spread == "constant"
+    np.testing.assert_allclose(band.half_width(0.9, TIME), calibrate(distances(12, seed=1), TIME).half_width(0.9, TIME))
+
+
+def test_a_run_that_comes_several_times_never_judges_itself() -> None:
+    once = distances(4, seed=1)
+    twice = calibrate([*once, *once], TIME, runs=np.array([0, 1, 2, 3, 0, 1, 2, 3]))
+    np.testing.assert_allclose(twice.half_width(0.9, TIME), calibrate(once, TIME).half_width(0.9, TIME), rtol=1e-5)
+    assert twice.runs == 4

@@ -26,7 +26,7 @@ class WithBand:
     def reconstruct(self, displacement):
         return self._predictor.reconstruct(displacement)
 
-    def half_width(self, share, time):
+    def half_width(self, share, time, parameters):
         assert share == 0.9
         return None if self._width is None else np.full((len(time), 1), self._width, np.float32)
 
