@@ -8,14 +8,15 @@ import crashkit
 
 run, pictures = crashkit.open_dataset("kart.zarr").sel(sim="run_029"), []
 predicted = crashkit.predict("mh", {name: float(run[name]) for name in run.crash.parameters}, full=True)
-plot = pv.Plotter(off_screen=True, window_size=(720, 420))
+plot = pv.Plotter(off_screen=True, window_size=(720, 540))
+colours = {"cmap": "inferno_r", "clim": (0, 15), "scalar_bar_args": {"position_y": 0.88}}
 for state, u in enumerate(predicted.values):
     truth, mesh = run.crash.to_pyvista(time=state), run.crash.surface()
     mesh.points += u
     mesh["error (cm)"] = 100 * np.linalg.norm(mesh.points - truth.points, axis=1)
     plot.clear_actors()
     plot.add_mesh(truth, color="lightgrey", reset_camera=state == 0)
-    plot.add_mesh(mesh, scalars="error (cm)", cmap="inferno_r", clim=(0, 10), reset_camera=False)
-    plot.camera.zoom(1.4 if state == 0 else 1)
+    plot.add_mesh(mesh, scalars="error (cm)", reset_camera=False, **colours)
+    plot.camera.zoom(0.85 if state == 0 else 1)
     pictures.append(Image.fromarray(plot.screenshot(return_img=True)).quantize(64))
 pictures[0].save("animation.gif", save_all=True, append_images=pictures[1:], duration=100, loop=0)
