@@ -67,13 +67,13 @@ def trained(data: Path, folder: Path, preset: str, epochs: int, test: str) -> Su
         last = epoch.name
 
     made = train(
-        data, folder, "mh", overrides=overrides, preset=preset, test=test, device="cpu", resume=resume, report=tell
+        data, folder, "mh", settings=overrides, preset=preset, test=test, device="cpu", resume=resume, report=tell
     )
     done[last] = time.perf_counter() - started
     if any(fit.status == "interrupted" for fit in made.record.fits.values()):
         raise SystemExit("interrupted; the same command goes on")
     folder.with_name(f"{folder.name}.seconds.json").write_text(json.dumps(done), encoding="utf-8")
-    return made
+    return made.surrogate
 
 
 def seconds_to_best(model: Surrogate, number: int) -> float:

@@ -15,9 +15,11 @@ from crashkit.version import __version__ as __version__
 if TYPE_CHECKING:
     from crashkit.api.coarsen import coarsen as coarsen
     from crashkit.api.evaluate import evaluate as evaluate
+    from crashkit.api.model import Model as Model
     from crashkit.api.predict import load_model as load_model
     from crashkit.api.predict import predict as predict
     from crashkit.api.train import train as train
+    from crashkit.api.validate import validate as validate
     from crashkit.dataset import demo_data as demo_data
     from crashkit.dataset import open_dataset as open_dataset
     from crashkit.errors import CrashkitError as CrashkitError
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
     from crashkit.mesh.levels import Hierarchy as Hierarchy
     from crashkit.mesh.store import open_hierarchy as open_hierarchy
     from crashkit.writers.paraview import write_paraview as write_paraview
-    from data_schema import validate as validate
+    from data_schema import Violation as Violation
     from evaluation.comparison.result import Evaluation as Evaluation
     from evaluation.errors import EvaluationError as EvaluationError
     from surrogates.errors import SurrogateError as SurrogateError
@@ -44,9 +46,11 @@ _LAZY = {
     "Hierarchy": "crashkit.mesh.levels",
     "IngestSummary": "crashkit.ingestion.ingest",
     "MeshError": "crashkit.errors",
+    "Model": "crashkit.api.model",
     "OutputError": "crashkit.errors",
     "ReadError": "crashkit.errors",
     "SurrogateError": "surrogates.errors",
+    "Violation": "data_schema",
     "coarsen": "crashkit.api.coarsen",
     "demo_data": "crashkit.dataset",
     "evaluate": "crashkit.api.evaluate",
@@ -56,7 +60,7 @@ _LAZY = {
     "open_hierarchy": "crashkit.mesh.store",
     "predict": "crashkit.api.predict",
     "train": "crashkit.api.train",
-    "validate": "data_schema",
+    "validate": "crashkit.api.validate",
     "write_paraview": "crashkit.writers.paraview",
 }
 

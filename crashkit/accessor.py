@@ -26,6 +26,38 @@ class CrashAccessor:
     def __init__(self, dataset: xr.Dataset) -> None:
         self._dataset = dataset
 
+    def __repr__(self) -> str:
+        from crashkit.display import as_text
+
+        return as_text(*self._facts())
+
+    def _repr_html_(self) -> str:
+        from crashkit.display import as_html
+
+        return as_html(*self._facts())
+
+    def _facts(self) -> tuple[str, dict[str, object]]:
+        """What the dataset is; reads the small variables only."""
+        from crashkit.display import listed
+
+        ds = self._dataset
+        time = np.atleast_1d(ds["time"].values) if "time" in ds.variables else np.empty(0)
+        names = np.atleast_1d(ds["part_name"].values) if "part_name" in ds.variables else ()
+        facts: dict[str, object] = {
+            "runs": f"{ds.sizes['sim']}: {listed(ds['sim'].values)}"
+            if "sim" in ds.coords and "sim" in ds.dims
+            else "one",
+            "states": f"{len(time)} from {time[0]:.4g} to {time[-1]:.4g} s" if len(time) else "none",
+            "mesh": f"{ds.sizes.get('node', 0)} nodes, {ds.sizes.get('face', 0)} faces, {ds.sizes.get('cell', 0)} cells",
+            "parts": listed(names),
+            "parameters": listed(
+                f"{n} ({ds[n].attrs.get('units', '?')}) {float(ds[n].min()):.4g} to {float(ds[n].max()):.4g}"
+                for n in self.parameters
+            ),
+        }
+        facts |= {name: ds.attrs[name] for name in ("solver", "title", "checksum") if ds.attrs.get(name)}
+        return "crash dataset", facts
+
     @property
     def parameters(self) -> list[str]:
         """Names of the design parameters."""
@@ -117,6 +149,9 @@ class CrashAccessor:
         from data_schema import fields
 
         ds = self._run(sim)
+        missing = [n for n in ("displacement", "reference_position", "face_nodes") if n not in ds.variables]
+        if missing:
+            raise DataError(f"the dataset has no {', '.join(missing)}; drawing needs the displacements and the mesh")
         if "time" in ds.dims:
             is_place = isinstance(time, (int, np.integer))
             ds = ds.isel(time=int(time)) if is_place else ds.sel(time=time, method="nearest")
@@ -133,6 +168,7 @@ class CrashAccessor:
                 mesh.point_data[name] = values
             elif ds[name].dims[0] == "face":
                 mesh.cell_data[name] = values[alive]
+        mesh.set_active_scalars("displacement")  # what `.plot()` shows
         mesh.field_data["TimeValue"] = [float(ds["time"])]
         return mesh
 
@@ -151,9 +187,17 @@ class CrashAccessor:
         corners = ds["face_nodes"].values[which]
         padded = np.column_stack([(corners >= 0).sum(axis=1), corners])
         valid = padded >= 0
-        mesh = pyvista.PolyData(points, faces=padded[valid])
-        mesh.point_data["node_id"] = ds["node_id"].values
-        mesh.cell_data["part_id"] = ds["part_id"].values[ds["face_part"].values[which]]
+        mesh = pyvista.PolyData(points, faces=padded[valid]) if len(corners) else pyvista.PolyData(points)
+        if "line_nodes" in ds and ds.sizes["line"]:  # edges without a face, of coarse levels
+            ends = ds["line_nodes"].values
+            lines = np.column_stack([np.full(len(ends), 2), ends]).ravel()
+            mesh = pyvista.PolyData(points, faces=padded[valid] if len(corners) else None, lines=lines)
+        if "node_id" in ds:
+            mesh.point_data["node_id"] = ds["node_id"].values
+        if mesh.n_cells != len(corners):
+            return mesh  # lines and lone points have no part
+        if "face_part" in ds and "part_id" in ds:
+            mesh.cell_data["part_id"] = ds["part_id"].values[ds["face_part"].values[which]]
         if "face_id" in ds:
             mesh.cell_data["element_id"] = ds["face_id"].values[which]
         return mesh

@@ -72,6 +72,7 @@ def open_dataset(path: str | Path, *, chunks: Literal["stored"] | Mapping[str, i
         for variable in dataset.variables.values():
             variable.attrs.pop(RUNS_WITH, None)  # of the store, not of what it holds
         out = dataset.assign({n: _as_text(v) for n, v in dataset.variables.items() if v.dtype.kind in "OT"})
+    out.encoding["source"] = str(path.absolute())  # a dataset in hand finds its mesh hierarchy by it
     out.set_close(dataset.close)
     return out
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -56,3 +57,19 @@ def complete_folder(output: Path, mark: str) -> Iterator[Path]:
 def file_name(name: str) -> str:
     """`name` with everything that is troublesome in file names replaced by a dash."""
     return re.sub(r"[^A-Za-z0-9_.+=-]+", "-", name).strip("-.") or "run"
+
+
+def check_model_folder(output: Path, overwrite: bool) -> None:
+    """Raise OutputError if a model cannot be stored as the folder `output`: better now than after the training."""
+    if output.exists():
+        if not output.is_dir() or (any(output.iterdir()) and not (output / "model.json").exists()):
+            raise OutputError(f"{output}: exists and is no model folder; choose another place with -o")
+        if not overwrite and any(output.iterdir()):
+            raise OutputError(f"{output}: holds a model already; replace it with --overwrite, or choose another place")
+    home = output.absolute().parent
+    try:
+        home.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{output}: cannot be written ({error.strerror}); choose another place with -o") from error
+    if not os.access(home, os.W_OK | os.X_OK):
+        raise OutputError(f"{output}: cannot be written (no permission in {home}); choose another place with -o")

@@ -44,7 +44,9 @@ register("quadratic", make)
 
 if __name__ == "__main__":
     data, output, test = sys.argv[1:4]
-    surrogate = train(data, Path(output), "mh", overrides=["level.reduction=quadratic", "level.epochs=20"], test=test)
+    surrogate = train(
+        data, Path(output), "mh", settings=["level.reduction=quadratic", "level.epochs=20"], test=test
+    ).surrogate
     ranges = surrogate.record.ranges
     run = surrogate.predict_full((ranges.low + ranges.high) / 2)
     for level, error in surrogate.record.errors.items():

@@ -8,7 +8,8 @@ data (nodes, inputs) are not settings.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Mapping
+import difflib
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -315,7 +316,10 @@ class Settings(_Frozen):
         if list(self.levels) != sorted(self.levels, reverse=True):
             raise ValueError(f"levels {list(self.levels)} must go from coarse to fine, the largest number first")
         for number in self.at:
-            self.for_level(number)
+            try:
+                self.for_level(number)
+            except ValidationError as error:
+                raise SurrogateError(_told(error, ("at", number))) from error
         latents = {self.for_level(k).latent for k in (*self.at, -1)}
         if len(latents) > 1 and self.transfer.encoder == "add":
             raise ValueError(f"latent sizes {sorted(latents)} differ; transfer.encoder=add needs one size")
@@ -374,18 +378,19 @@ def settings(
     model: str | None = None,
     preset: str | None = None,
     file: str | Path | None = None,
-    overrides: Iterable[str] = (),
+    overrides: Mapping[str, Any] | Sequence[str | Mapping[str, Any] | Sequence[str]] = (),
 ) -> Settings:
     """The settings for one training.
 
     file       YAML with the fields of `Settings`; its `model` and `preset` hold unless given here
-    overrides  "path=value" with a dotted path and a YAML value, such as "level.mlp.widths=[32, 32]" or "at.3.epochs=9"
+    overrides  a dictionary, nested or with dotted paths: {"level": {"epochs": 20}} or {"level.epochs": 20}; or texts
+               "path=value" with a dotted path and a YAML value, such as "level.mlp.widths=[32, 32]" or "at.3.epochs=9";
+               or a list of both, of which later ones win
 
     Raises SurrogateError naming the field, what was found and what is possible.
     """
     given: dict[Any, Any] = _read(Path(file)) if file is not None else {}
-    for text in overrides:
-        given = _merged(given, _override(text))
+    given = _merged(given, _given(overrides))
     model, preset = model or given.get("model", "mh"), preset or given.get("preset", "fast")
     if model not in MODELS:
         raise SurrogateError(f"model {model!r} is not known; choose {_listed(MODELS)}")
@@ -401,6 +406,8 @@ def parse(values: Mapping[str, Any], where: str) -> Settings:
         return Settings.model_validate(values)
     except ValidationError as error:
         raise SurrogateError(f"{where}: {_told(error)}") from error
+    except SurrogateError as error:
+        raise SurrogateError(f"{where}: {error}") from error
 
 
 def _read(file: Path) -> dict[str, Any]:
@@ -428,9 +435,34 @@ def _override(text: str) -> dict[Any, Any]:
     if isinstance(parsed, str):  # YAML 1.1 reads 1e-3 as text
         with contextlib.suppress(ValueError):
             parsed = float(parsed)
-    out: Any = parsed
-    for key in reversed(path.strip().split(".")):
+    return _at_path(path, parsed)
+
+
+def _given(overrides: str | Mapping[str, Any] | Sequence[Any]) -> dict[Any, Any]:
+    """Texts, dictionaries, or a list of such, as one nested dictionary; later ones win."""
+    if isinstance(overrides, str):
+        return _override(overrides)
+    if isinstance(overrides, Mapping):
+        return _nested(overrides)
+    out: dict[Any, Any] = {}
+    for some in overrides:
+        out = _merged(out, _given(some))
+    return out
+
+
+def _at_path(path: object, value: Any) -> dict[Any, Any]:
+    """`value` at a dotted path, as nested dictionaries; numbers in the path are level numbers."""
+    out = value
+    for key in reversed(str(path).strip().split(".")):
         out = {int(key) if key.isdigit() else key: out}
+    return dict(out)
+
+
+def _nested(values: Mapping[Any, Any]) -> dict[Any, Any]:
+    """A dictionary without dotted paths."""
+    out: dict[Any, Any] = {}
+    for path, value in values.items():
+        out = _merged(out, _at_path(path, _nested(value) if isinstance(value, Mapping) else value))
     return out
 
 
@@ -443,18 +475,46 @@ def _merged(below: Mapping[Any, Any], above: Mapping[Any, Any]) -> dict[Any, Any
     return out
 
 
-def _told(error: ValidationError) -> str:
+def _told(error: ValidationError, above: tuple[int | str, ...] = ()) -> str:
+    """The first of the errors in one line; `above` is the place of what was validated."""
     first = error.errors()[0]
-    place = ".".join(str(p) for p in first["loc"]) or "settings"
+    place = (*above, *first["loc"])
+    path = ".".join(map(str, place)) or "settings"
     if first["type"] == "extra_forbidden":
-        fields = _fields_at(first["loc"][:-1])
-        return f"{place} is not a setting" + (f"; there are {_listed(fields)}" if fields else "")
+        fields = _fields_at(place[:-1])
+        near = _nearest(place, fields)
+        return (
+            f"{path} is not a setting; " + (f"did you mean {near}? " if near else "") + f"there are {_listed(fields)}"
+        )
     message = first["msg"].removeprefix("Value error, ")
-    return f"{place} = {first['input']!r}: {message}" if first["loc"] else message
+    return f"{path} = {first['input']!r}: {message}" if place else message
+
+
+def _nearest(place: tuple[int | str, ...], fields: Sequence[str]) -> str | None:
+    """What was probably meant: a field of the same place, or one of that name elsewhere; None where nothing is near."""
+    *above, own = map(str, place)
+    near = difflib.get_close_matches(own, fields, n=1)
+    if near:
+        return ".".join([*above, *near])
+    paths = {path.rpartition(".")[2]: path for path in reversed(_paths(Settings))}
+    found = difflib.get_close_matches(own, paths, n=1)
+    return paths[found[0]] if found else None
+
+
+def _paths(kind: type[BaseModel]) -> list[str]:
+    """Dotted names of all settings."""
+    out = []
+    for name, field in kind.model_fields.items():
+        out.append(name)
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            out += [f"{name}.{path}" for path in _paths(field.annotation)]
+    return out
 
 
 def _fields_at(place: tuple[int | str, ...]) -> list[str]:
     kind: Any = Settings
+    if place[:1] == ("at",):
+        place = ("level", *place[2:])  # single levels have the fields of all
     for key in place:
         field = kind.model_fields.get(str(key)) if isinstance(kind, type) and issubclass(kind, BaseModel) else None
         kind = None if field is None else field.annotation

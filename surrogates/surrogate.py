@@ -108,16 +108,31 @@ class Surrogate:
     def reconstruct(self, states: ArrayLike, level: int | None = None) -> NDArray[np.float32]:
         """Encode and decode displacements (state, node of `level`, 3), m: what the reduction alone costs."""
         number = self.number(level)
-        x = np.asarray(states, np.float32)
-        nodes = self.graphs.n_nodes(number)
-        if x.ndim != 3 or x.shape[1:] != (nodes, 3):
-            raise SurrogateError(f"states have the shape {x.shape}; expected (state, {nodes} nodes, 3)")
+        x = self._states(states, number)
         if isinstance(self.core, PodRegression):
             return self.core.reconstruct(x, number)
         core = self.core
         with torch.no_grad():
             parts = [core.reconstruct(part.transpose(0, 1), number) for part in torch.from_numpy(x).split(_CHUNK)]
         return torch.cat([part.transpose(0, 1) for part in parts]).contiguous().numpy()
+
+    def encode(self, states: ArrayLike, level: int | None = None) -> NDArray[np.float32]:
+        """Displacements (state, node of `level`, 3), m -> latent vectors (state, latent)."""
+        number = self.number(level)
+        x = self._states(states, number)
+        if isinstance(self.core, PodRegression):
+            return self.core.encode(x)
+        core = self.core
+        with torch.no_grad():
+            parts = [core.encode_metres(part.transpose(0, 1), number) for part in torch.from_numpy(x).split(_CHUNK)]
+        return torch.cat(parts).numpy()
+
+    def _states(self, states: ArrayLike, number: int) -> NDArray[np.float32]:
+        x = np.asarray(states, np.float32)
+        nodes = self.graphs.n_nodes(number)
+        if x.ndim != 3 or x.shape[1:] != (nodes, 3):
+            raise SurrogateError(f"states have the shape {x.shape}; expected (state, {nodes} nodes, 3)")
+        return x
 
     def has_band(self, level: int | None = None) -> bool:
         """Whether there were runs enough for `band` on the full mesh."""

@@ -1,4 +1,4 @@
-"""From a dataset on disk to what a surrogate is trained on: the training runs as arrays, the test runs left out."""
+"""From a dataset to what a surrogate is trained on: the training runs as arrays, the test runs left out."""
 
 from __future__ import annotations
 
@@ -11,45 +11,50 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
+    from crashkit.api.source import Source
+    from crashkit.selection import WhichRuns
     from surrogates.data.campaign import Campaign, Labels, Mirror
 
 
 class RunField:
     """Displacements (sim, state, node, 3) of chosen runs, m; a run is read when it is asked for."""
 
-    def __init__(self, path: Path, runs: Sequence[int], states: int, nodes: int) -> None:
-        self._path = path
+    def __init__(self, source: Source, runs: Sequence[int], shape: tuple[int, int]) -> None:
+        self._source = source
         self._runs = list(runs)
-        self.shape = (len(self._runs), states, nodes, 3)
+        self.shape = (len(self._runs), *shape, 3)
 
     def __getitem__(self, run: int) -> NDArray[np.float32]:
-        from crashkit.dataset import open_dataset, reading_dataset
+        from crashkit.dataset import reading_dataset
 
-        with open_dataset(self._path, chunks=None) as dataset, reading_dataset(self._path):
-            return dataset["displacement"].isel(sim=self._runs[run]).values
+        with self._source.opened() as dataset, reading_dataset(self._source.name):
+            values: NDArray[np.float32] = dataset["displacement"].isel(sim=self._runs[run]).values
+        return values
 
 
-def open_campaign(path: str | Path, test: Any = None, *, symmetry: bool = False) -> Campaign:
-    """The runs of the dataset at `path` without the test runs, as `crashkit.selection.runs_of` understands `test`.
+def open_campaign(source: Source, test: WhichRuns | None = None, *, symmetry: bool = False) -> Campaign:
+    """The runs of a dataset without the test runs, as `crashkit.selection.runs_of` understands `test`.
 
     symmetry  look for mirror planes of the mesh, where a parameter could say on which side something happens
 
     The full field is read run by run by those models that need it; the cascade reads its levels only.
 
-    Raises ReadError or DataError where the dataset cannot be opened or `test` names no runs, or all.
+    Raises
+    ------
+    ReadError, DataError
+        Where the dataset cannot be opened, or `test` names no runs, or all.
     """
     import numpy as np
 
-    from crashkit.dataset import open_dataset, reading_dataset
+    from crashkit.dataset import reading_dataset
     from crashkit.errors import DataError
-    from crashkit.mesh.store import has_hierarchy, level_displacement, read_hierarchy
+    from crashkit.mesh.store import level_displacement
     from crashkit.selection import runs_of
     from data_schema import fields, parameters, table_unit
     from data_schema.dimensions import dimension
     from surrogates.data.campaign import Campaign
 
-    path = Path(path)
-    with open_dataset(path) as opened, reading_dataset(path):
+    with source.opened() as opened, reading_dataset(source.name):
         erodes = "alive" in opened or "cell_alive" in opened
         unread = [n for n in ("displacement", "alive", "cell_alive", "history") if n in opened]
         dataset = opened.drop_vars([*unread, *fields(opened)]).load()
@@ -58,15 +63,21 @@ def open_campaign(path: str | Path, test: Any = None, *, symmetry: bool = False)
     held_out = [] if test is None else runs_of(runs, test)
     chosen = [k for k in range(len(runs)) if k not in set(held_out)]
     if not chosen:
-        raise DataError(f"{path}: all {len(runs)} runs would be test runs; leave some for training")
+        raise DataError(f"{source.name}: all {len(runs)} runs would be test runs; leave some for training")
     names = parameters(dataset)
     if not names:
-        raise DataError(f"{path}: no run has a parameter; give them with crashkit ingest --params")
+        raise DataError(f"{source.name}: no run has a parameter; give them with crashkit ingest --params")
     at = dataset["reference_position"]
-    coarse = read_hierarchy(path).levels if has_hierarchy(path) else ()
+    levels = () if source.hierarchy is None else source.hierarchy.levels
+    field = RunField(source, chosen, (states, nodes))
 
     def displacement(level: int) -> Any:
-        return RunField(path, chosen, states, nodes) if level == 0 else level_displacement(path, level, chosen)
+        if level == 0:
+            return field
+        if source.stored and source.path is not None:
+            return level_displacement(source.path, level, chosen)
+        kept = levels[level - 1].kept
+        return np.stack([field[run][:, kept] for run in range(len(chosen))])
 
     values = np.stack([dataset[n].values[chosen].astype(np.float64) for n in names], axis=1)
     two_sided = bool(((values.min(axis=0) < 0) & (values.max(axis=0) > 0)).any())
@@ -77,11 +88,11 @@ def open_campaign(path: str | Path, test: Any = None, *, symmetry: bool = False)
         time=dataset["time"].values.astype(np.float64),
         displacement=displacement,
         n_nodes=nodes,
-        levels=coarse,
+        levels=levels,
         full_edges=dataset.crash.edges(),
         runs=tuple(runs[k] for k in chosen),
         checksum=str(dataset.attrs.get("checksum", "")),
-        attributes={"dataset": path.name, "solver": str(dataset.attrs.get("solver", ""))},
+        attributes={"dataset": Path(source.name).name, "solver": str(dataset.attrs.get("solver", ""))},
         held_out=tuple(runs[k] for k in held_out),
         erodes=erodes,
         points=np.asarray((at.isel(sim=0) if "sim" in at.dims else at).values, np.float64),

@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from crashkit.mesh.levels import Hierarchy
 
 
 def coarsen(
-    path: str | Path,
+    dataset: str | Path | xr.Dataset,
     nodes: Sequence[int] | None = None,
     ratios: Sequence[float] | None = None,
     *,
@@ -20,27 +22,45 @@ def coarsen(
     pair_distance: float | None = None,
     report: Callable[[int, int], None] | None = None,
 ) -> Hierarchy:
-    """Build the mesh hierarchy of the dataset at `path` and write it into it, with the displacements of level 1.
+    """Build the mesh hierarchy of a dataset, and write it into the dataset where that is given by its path.
 
-    `nodes` are the exact node counts of level 1, 2, ..; or `ratios` by how much each level has fewer nodes than the
-    finer one (default 8, 4, 4). `pair_distance`, m: see `crashkit.mesh.build_hierarchy`. `report(done, runs)` follows
-    the pass over the runs. An older hierarchy is replaced once the new one is complete. Parts that have no faces (beams,
-    particles) are named in a `UserWarning`, since their nodes take their displacements from other parts.
+    Parts that have no faces (beams, particles) are named in a `UserWarning`, since their nodes take their displacements
+    from other parts.
+
+    Parameters
+    ----------
+    dataset
+        Path of a crash dataset: the hierarchy is stored in it, with the displacements of level 1, and an older one
+        is replaced once the new one is complete. Or the dataset in hand: then nothing is written; pass what is returned
+        to `crashkit.train(dataset, hierarchy=...)`.
+    nodes
+        Exact number of nodes of level 1, 2, ...
+    ratios
+        Instead: how many times fewer nodes each level has than the finer one. Default: 8, 4, 4.
+    selection
+        How nodes are selected: quadric (half-edge contraction) or vtk (vtkQuadricDecimation).
+    pair_distance
+        m; see `crashkit.mesh.build_hierarchy`.
+    report
+        Called with (runs done, runs) in the pass over the runs.
 
     Raises
     ------
     MeshError
-        For counts that cannot be had.
+        For numbers of nodes that cannot be had.
     DataError, ReadError, OutputError
         For the files.
     """
+    import xarray as xr
+
     from crashkit.errors import MeshError
     from crashkit.mesh.hierarchy import build_hierarchy, ratios_to_counts
-    from crashkit.mesh.store import open_mesh, parts_without_faces, write_hierarchy
+    from crashkit.mesh.store import mesh_of, open_mesh, parts_without_faces, write_hierarchy
 
     if nodes is not None and ratios is not None:
         raise MeshError("both node counts and ratios were given; give one of them")
-    mesh = open_mesh(Path(path))
+    in_hand = isinstance(dataset, xr.Dataset)
+    mesh = mesh_of(dataset) if isinstance(dataset, xr.Dataset) else open_mesh(Path(dataset))
     try:
         hierarchy = build_hierarchy(
             mesh.position,
@@ -51,8 +71,9 @@ def coarsen(
             pair_distance=pair_distance,
         )
     except MeshError as error:
-        raise MeshError(f"{path}: {error}") from error
-    for text in parts_without_faces(Path(path)):
-        warnings.warn(text, stacklevel=2)
-    write_hierarchy(path, hierarchy, progress=report)
+        raise MeshError(f"{'the dataset' if in_hand else dataset}: {error}") from error
+    if not isinstance(dataset, xr.Dataset):
+        for text in parts_without_faces(Path(dataset)):
+            warnings.warn(text, stacklevel=2)
+        write_hierarchy(dataset, hierarchy, progress=report)
     return hierarchy

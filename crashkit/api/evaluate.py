@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,6 +17,10 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
+    from crashkit.api.model import Model as Trained
+    from crashkit.api.source import Source
+    from crashkit.mesh.levels import Hierarchy
+    from crashkit.selection import WhichRuns
     from data_schema.levels import Level
     from evaluation.comparison.predictor import Model
     from evaluation.comparison.reference import Reference
@@ -24,16 +29,18 @@ if TYPE_CHECKING:
     from evaluation.comparison.sensors import Sensors
     from surrogates.surrogate import Surrogate
 
+    GivenModel = Trained | Surrogate | str | Path
 
 Progress = Callable[[str, int, int], None]  # what is being done, steps done, steps in all
 
 
 def evaluate(
-    dataset: str | Path,
-    models: Sequence[str | Path],
-    output: str | Path,
+    dataset: str | Path | xr.Dataset,
+    models: GivenModel | Sequence[GivenModel],
+    output: str | Path | None = None,
     *,
-    test: Sequence[str] | None = None,
+    test: WhichRuns | None = None,
+    hierarchy: Hierarchy | None = None,
     write_vtu: bool = False,
     write_vtkhdf: bool = False,
     vtk_runs: Sequence[str] | None = None,
@@ -45,52 +52,84 @@ def evaluate(
     overwrite: bool = False,
     report: Progress | None = None,
 ) -> Evaluation:
-    """Compare stored models on runs none of them has seen, and write everything into the folder `output`.
-
-    dataset    path of a crash dataset (.zarr or .nc), with a hierarchy where models work on coarse levels
-    models     model folders; those that differ only in their seed become one row with its spread
-    test       names of the test runs; default: those that all the models hold out
-    write_vtu  also write PVD + VTU with truth, prediction and error; write_vtkhdf: the same as VTKHDF
-    vtk_runs   the runs written so; default: the worst and the median run of the best model
-    probes     the solver's numbers of nodes whose histories are compared; default: four spread over the structure
-    intrusion  name of a part and a direction (x, -x, y, -y, z or -z); default: the whole structure, against its motion
-    workers    processes that share the runs; `scheduler`, the address of a Dask scheduler, is used instead
-    overwrite  replace an earlier report in `output`
-    report     called with what is being done and how far it is
+    """Compare models on runs none of them has seen, and write everything into the folder `output`.
 
     The folder appears under its name when it is complete. Peak memory is one run a worker.
 
-    Raises EvaluationError where the comparison would not be honest or the models do not fit the data, DataError,
-    ReadError and ModelFolderError where files are not what they should be, OutputError where `output` cannot be
-    written.
+    Parameters
+    ----------
+    dataset
+        Path of a crash dataset, or the dataset in hand: all runs, or a selection with training and test runs.
+    models
+        One or several: as `crashkit.train` and `crashkit.load_model` return them, or folders. Those that differ only
+        in their seed become one row with its spread.
+    output
+        Folder for the report; without it nothing is written, and the numbers are in what is returned.
+    test
+        Test runs: names, or a selection such as "27:36"; default: those that all the models hold out, and where the
+        models hold out none, the runs of a dataset in hand that no model has seen.
+    hierarchy
+        Mesh hierarchy of a dataset in memory, as `crashkit.coarsen(dataset)` returns it.
+    write_vtu, write_vtkhdf
+        Also write truth, prediction and error for ParaView, as PVD + VTU or as VTKHDF.
+    vtk_runs
+        The runs written so; default: the worst and the median run of the best model.
+    probes
+        The solver's numbers of nodes whose histories are compared; default: four spread over the structure.
+    intrusion
+        Name of a part and a direction (x, -x, y, -y, z or -z); default: the whole structure, against its motion.
+    workers, scheduler
+        Processes that share the runs; or the address of a Dask scheduler, which is used instead.
+    seeds_as_spread
+        Whether models that differ only in their seed become one row.
+    overwrite
+        Replace an earlier report in `output`.
+    report
+        Called with what is being done and how far it is.
+
+    Raises
+    ------
+    EvaluationError
+        Where the comparison would not be honest, or the models do not fit the data.
+    DataError, ReadError, ModelFolderError
+        Where files are not what they should be.
+    OutputError
+        Where `output` cannot be written.
     """
     from crashkit.extras import need
 
     need("evaluating models", "train", "report")
-    from crashkit.output import complete_folder, refuse_earlier
+    from crashkit.api.source import source_of
+    from crashkit.output import refuse_earlier
     from crashkit.parallel import as_finished
     from evaluation.comparison.result import compare, decompose
     from evaluation.comparison.sensors import choose_sensors
     from evaluation.comparison.split import agree_on_split, entries
+    from evaluation.errors import EvaluationError
     from evaluation.figures import kinds
     from evaluation.report.files import default_runs, write_run
     from evaluation.report.report import write_report
 
     tell = report or (lambda what, done, total: None)
     formats = [suffix for suffix, wanted in ((".pvd", write_vtu), (".vtkhdf", write_vtkhdf)) if wanted]
-    if not overwrite:
+    if output is not None and not overwrite:
         refuse_earlier(Path(output), "report.json", "report")
-    paths = (str(dataset), tuple(map(str, models)))
-    reference, stored = _opened(*paths)
-    split = agree_on_split(reference, stored, test)
+    source = source_of(dataset, hierarchy)
+    asked = _asked(models)
+    reference, stored = _opened(source, asked)
+    split = agree_on_split(reference, stored, _test_names(source, reference, stored, test))
+    if not split.train:
+        raise EvaluationError(
+            f"{source.name}: holds test runs alone; give the training runs, too, by which the data is described"
+        )
     entries(stored, seeds_as_spread)  # refuses what cannot be compared before anything is computed
     reference.index(vtk_runs or ())
     sensors = choose_sensors(reference, probes, intrusion)
-    with complete_folder(Path(output), "report.json") as folder:
+    with _folder(output) as folder:
         with _counted(tell, "modes of the training runs", len(split.train)) as step:
             pods = decompose(reference, split.train, done=step)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".modes-") as kept:
-            scorer = Scorer(*paths, _keep_modes(pods, Path(kept)), sensors, opened=(reference, stored))
+            scorer = Scorer(source, asked, _keep_modes(pods, Path(kept)), sensors, opened=(reference, stored))
             scored: dict[int, RunScores] = {}
             with _counted(tell, "test runs", len(split.test)) as step:
                 for place, scores in as_finished(
@@ -101,7 +140,7 @@ def evaluate(
                     step(split.test[place])
         result = compare(
             reference, stored, split, seeds_as_spread=seeds_as_spread, pods=pods, scored=[scored[k] for k in sorted(scored)],
-            sensors=sensors, context=_context(Path(dataset), reference, stored, split),
+            sensors=sensors, context=_context(Path(source.name), reference, stored, split),
         )  # fmt: skip
         if formats:
             runs = reference.index(vtk_runs) if vtk_runs else default_runs(result)
@@ -111,9 +150,59 @@ def evaluate(
                     written += write_run(result, run, folder / "vtk", formats)
                     step(run)
             result = dataclasses.replace(result, files=tuple(written))
-        with _counted(tell, "figures", len(kinds())) as step:
-            write_report(result, folder, done=lambda name: step(0))
+        if output is not None:
+            with _counted(tell, "figures", len(kinds())) as step:
+                write_report(result, folder, done=lambda name: step(0))
     return result
+
+
+def _folder(output: str | Path | None) -> contextlib.AbstractContextManager[Path]:
+    """Where results are put together: the folder that becomes `output`, or one that vanishes."""
+    from crashkit.output import complete_folder
+
+    return _scratch() if output is None else complete_folder(Path(output), "report.json")
+
+
+@contextlib.contextmanager
+def _scratch() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(prefix="crashkit-") as folder:
+        yield Path(folder)
+
+
+def _asked(models: GivenModel | Sequence[GivenModel]) -> tuple[tuple[str, Trained | Path], ...]:
+    """Each model with the name that tells it apart; those stored in a folder as that, which travels lightly."""
+    from crashkit.api.model import Model as Trained
+
+    several = [models] if isinstance(models, (str, Path)) or not isinstance(models, Sequence) else models
+    out: list[tuple[str, Trained | Path]] = []
+    for given in several:
+        if isinstance(given, (str, Path)):
+            out.append((str(given), Path(given)))
+            continue
+        model = given if isinstance(given, Trained) else Trained(given)
+        taken = {name for name, _ in out}
+        name = model.name if model.folder is None else str(model.folder)
+        names = itertools.chain([name], (f"{name}-{k}" for k in itertools.count(2)))
+        out.append((next(n for n in names if n not in taken), model))
+    return tuple(out)
+
+
+def _test_names(
+    source: Source, reference: Reference, models: Sequence[Model], test: WhichRuns | None
+) -> Sequence[str] | None:
+    """Names of the test runs that were asked for; None to take those that the models hold out."""
+    from crashkit.selection import runs_of
+
+    if test is not None:
+        listed = isinstance(test, Sequence) and not isinstance(test, str) and all(isinstance(n, str) for n in test)
+        return list(map(str, test)) if listed else [reference.runs[k] for k in runs_of(reference.runs, test)]  # type: ignore[arg-type]
+    if source.dataset is None:
+        return None
+    held_out = {name for model in models for name in model.held_out_runs}
+    seen = {name for model in models for name in (*model.fitted_runs, *model.tuned_runs)}
+    mine = [name for name in reference.runs if (name in held_out if held_out else name not in seen)]
+    same = all(set(model.held_out_runs) == held_out for model in models)
+    return mine if same else None
 
 
 @contextlib.contextmanager
@@ -137,10 +226,13 @@ def _score(run: int, scorer: Scorer) -> RunScores:
 
 @dataclass
 class Scorer:
-    """Scores runs. Sent to another process it leaves behind what is open, and opens the files there once."""
+    """Scores runs. Sent to another process it leaves behind what is open, and opens the files there once.
 
-    dataset: str
-    models: tuple[str, ...]
+    A dataset or a model in hand travels as it is.
+    """
+
+    source: Source
+    models: tuple[tuple[str, Trained | Path], ...]
     modes: Mapping[int, str]
     sensors: Sensors
     opened: tuple[Reference, tuple[Model, ...]] | None = None
@@ -155,7 +247,7 @@ class Scorer:
         from evaluation.comparison.scoring import score_run
 
         if self.opened is None:
-            self.opened = _opened(self.dataset, self.models)
+            self.opened = _opened(self.source, self.models)
         reference, models = self.opened
         modes = {level: np.load(path, mmap_mode="r", allow_pickle=False) for level, path in self.modes.items()}
         with _one_thread():
@@ -174,19 +266,27 @@ def _keep_modes(pods: Mapping[int, Any], folder: Path) -> dict[int, str]:
     return out
 
 
-def _opened(dataset: str, models: tuple[str, ...]) -> tuple[Reference, tuple[Model, ...]]:
+def _opened(source: Source, models: tuple[tuple[str, Trained | Path], ...]) -> tuple[Reference, tuple[Model, ...]]:
     """The dataset and the models as evaluation sees them."""
-    from crashkit.api.predict import load_model
+    from crashkit.api.predict import model_in_hand
     from crashkit.dataset import open_dataset
-    from crashkit.mesh.store import has_hierarchy, read_hierarchy
+    from crashkit.errors import DataError
     from evaluation.comparison.reference import reference_of
 
-    surrogates = [(Path(folder), load_model(folder)) for folder in models]
-    opened = open_dataset(dataset, chunks=None)
+    surrogates = [(Path(name), model_in_hand(model).surrogate) for name, model in models]
+    opened = open_dataset(source.name, chunks=None) if source.dataset is None else source.dataset
     coarse = any(number > 0 for _, s in surrogates for number in s.level_names.values())
-    levels = read_hierarchy(dataset).levels if coarse or has_hierarchy(dataset) else ()
-    reference = reference_of(opened, levels)
-    reference = dataclasses.replace(reference, displacement=_reader(dataset, opened))
+    if coarse and source.hierarchy is None:
+        raise DataError(
+            f"{source.name}: has no mesh hierarchy; "
+            + (
+                f"run crashkit coarsen {source.name} first"
+                if source.path
+                else "give hierarchy=crashkit.coarsen(dataset)"
+            )
+        )
+    reference = reference_of(opened, () if source.hierarchy is None else source.hierarchy.levels)
+    reference = dataclasses.replace(reference, displacement=_reader(source.name, opened))
     return reference, tuple(as_model(surrogate, folder, reference) for folder, surrogate in surrogates)
 
 

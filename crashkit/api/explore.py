@@ -68,7 +68,7 @@ def explore(
     if output.exists() and not overwrite:
         raise OutputError(f"{output}: is there already; replace it with --overwrite, or choose another name")
     folders = [Path(models)] if isinstance(models, (str, Path)) else [Path(m) for m in models]
-    loaded = [load_model(folder) for folder in folders]
+    loaded = [load_model(folder).surrogate for folder in folders]
     first = loaded[0]
     if first.points is None or first.faces is None:
         raise DataError(f"{folders[0]}: the model was stored without its mesh; train it again from a dataset")

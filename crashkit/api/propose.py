@@ -108,7 +108,7 @@ def _most_useful(
     mirrored = sorted({*odd, *(n for n, r in box.parameters.items() if r.odd)})
     settings = [f"physics.odd=[{', '.join(mirrored)}]"] if mirrored else []
     with tempfile.TemporaryDirectory(prefix="crashkit-propose-") as folder:
-        surrogate = train(dataset, Path(folder) / "model", "pod-gpr", overrides=[*settings, f"seed={seed}"])
+        surrogate = train(dataset, Path(folder) / "model", "pod-gpr", settings=settings, seed=seed).surrogate
     known = Known.of(surrogate, box)
     points, share = known.best(known.of_runs(_parameters(dataset)), count, seed)
     error = known.judge(0.9, seed).error

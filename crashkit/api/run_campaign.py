@@ -159,9 +159,9 @@ def _train_and_judge(campaign: Campaign, confidence: float) -> tuple[Judgement, 
     odd = [n for n, r in study.parameters.items() if r.odd]
     told = [f"physics.odd=[{', '.join(odd)}]"] if odd else []
     surrogate = train(
-        campaign.dataset, campaign.folder / "process", "pod-gpr", overrides=[*told, f"seed={study.design.seed}"],
+        campaign.dataset, campaign.folder / "process", "pod-gpr", settings=told, seed=study.design.seed,
         overwrite=True,
-    )  # fmt: skip
+    ).surrogate  # fmt: skip
     known = Known.of(surrogate, study)
     judged = known.judge(confidence, study.design.seed)
     computed = campaign.points("done")
@@ -209,7 +209,7 @@ def _train_wanted(campaign: Campaign) -> Path | None:
     if study.nodes and not has_hierarchy(campaign.dataset):
         coarsen(campaign.dataset, nodes=list(study.nodes))
     train(
-        campaign.dataset, folder, study.model, overrides=[f"{k}={v}" for k, v in study.settings.items()], overwrite=True
+        campaign.dataset, folder, study.model, settings=[f"{k}={v}" for k, v in study.settings.items()], overwrite=True
     )
     return folder
 

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    import xarray as xr
+
+    from crashkit.api.model import Model
+    from crashkit.mesh.levels import Hierarchy
+    from crashkit.selection import WhichRuns
     from surrogates.data.campaign import Campaign
     from surrogates.settings import Settings
     from surrogates.surrogate import Surrogate
@@ -15,64 +21,113 @@ if TYPE_CHECKING:
 
 
 def train(
-    dataset: str | Path,
-    output: str | Path,
+    dataset: str | Path | xr.Dataset,
+    output: str | Path | None = None,
     model: str | None = None,
-    config: str | Path | None = None,
-    overrides: Sequence[str] = (),
     *,
     preset: str | None = None,
-    test: str | int | float | slice | Sequence[int | str] | None = None,
+    settings: Mapping[str, Any] | Sequence[str] = (),
+    config: str | Path | None = None,
+    seed: int | None = None,
+    epochs: int | None = None,
+    test: WhichRuns | None = None,
+    hierarchy: Hierarchy | None = None,
     device: str = "auto",
     resume: bool = False,
     overwrite: bool = False,
     checkpoint_every: int = 0,
     tensorboard: str | Path | None = None,
     report: Callable[[Epoch], None] | None = None,
-) -> Surrogate:
-    """Train a surrogate on the dataset at `dataset` and store it as the folder `output`.
-
-    model      mh, podnn, aenn, gaenn, pod-gpr or pod-rbf; without, what `config` says, else mh
-    config     YAML file with the fields of `surrogates.settings.Settings`
-    overrides  "path=value", such as "level.epochs=200"; they win over `config`
-    preset     fast, or paper for exactly what the paper does
-    test       runs that nobody may see: "27:36", names, a number or a fraction (drawn at random, seeded)
-    device     cpu, cuda, mps, or the best there is (auto)
-    resume     go on where an interrupted training of the same settings on the same data stopped
-    overwrite  replace a model that is already in `output`
-    checkpoint_every  epochs between two notes of the state of the training, kept beside `output` until it is done;
-                      0: about every half minute
-    tensorboard       folder for TensorBoard files
-    report            told after every epoch
+) -> Model:
+    """Train a surrogate, and store it as the folder `output`.
 
     Ctrl-C ends the training, and what there is gets stored. The folder appears under its name when it is complete.
 
-    Raises SurrogateError for settings and data that do not fit, DataError and ReadError for the dataset, OutputError
-    where `output` cannot be written, Diverged where a loss is not finite: then the last good weights are stored.
+    Parameters
+    ----------
+    dataset
+        Path of a crash dataset, or the dataset in hand: all runs, or a selection such as `dataset.isel(sim=slice(27))`.
+    output
+        Model folder; without it the model is returned and not stored (`Model.save` does that).
+    model
+        mh, podnn, aenn, gaenn, pod-gpr or pod-rbf; without it what `config` says, else mh.
+    preset
+        fast, or paper for exactly what the paper does.
+    settings
+        Over `config` and the preset: a dictionary, nested or with dotted names ({"level": {"epochs": 20}} or
+        {"level.epochs": 20}), or texts "level.epochs=20". Fields: `surrogates.settings.Settings`.
+    config
+        YAML file with the same fields.
+    seed, epochs
+        Random seed, and epochs of every level; over all of the above.
+    test
+        Runs held out for testing: "27:36", names, a number or a fraction (drawn at random, seeded).
+    hierarchy
+        Mesh hierarchy of a dataset in memory, as `crashkit.coarsen(dataset)` returns it. A dataset on disk has its own.
+    device
+        cpu, cuda, mps, or the best there is (auto).
+    resume
+        Go on where an interrupted training of the same settings on the same data stopped.
+    overwrite
+        Replace a model that is already in `output`.
+    checkpoint_every
+        Epochs between two notes of the state of the training, kept beside `output` until it is done; 0: about every
+        half minute.
+    tensorboard
+        Folder for TensorBoard files.
+    report
+        Called after every epoch.
+
+    Returns
+    -------
+    Model
+        To be asked with `predict`, `encode` and others.
+
+    Raises
+    ------
+    SurrogateError
+        For settings and data that do not fit; an unknown setting is named with the nearest one that there is. Diverged,
+        which is one, where a loss is not finite: then the last good weights are stored.
+    DataError, ReadError
+        For the dataset.
+    OutputError
+        Where `output` cannot be written.
     """
     from crashkit.extras import need
 
     need("training a model", "train")
     from crashkit.api.campaign import open_campaign
+    from crashkit.api.model import Model
+    from crashkit.api.source import source_of
+    from crashkit.output import check_model_folder
     from surrogates.errors import SurrogateError
-    from surrogates.settings import settings
+    from surrogates.settings import settings as all_settings
     from surrogates.storage.folder import save
     from surrogates.training.checkpoints import Checkpoints
     from surrogates.training.loop import Diverged
     from surrogates.training.train import train_surrogate
 
-    output = Path(output)
-    chosen = settings(model, preset, config, overrides)
-    check_output(output, overwrite)
+    given: dict[str, Any] = {} if seed is None else {"seed": seed}
+    given |= {} if epochs is None else {"level.epochs": epochs, "transfer.epochs": 1}
+    chosen = all_settings(model, preset, config, [settings, given])
+    folder = None if output is None else Path(output)
+    if folder is not None:
+        check_model_folder(folder, overwrite)
+    elif resume:
+        raise SurrogateError("resume goes on with a training beside its model folder; give output")
     by_folds = chosen.model in ("pod-gpr", "pod-rbf")
-    campaign = open_campaign(dataset, test, symmetry=by_folds and chosen.physics.symmetry == "auto")
-    state = output.with_name(f".{output.name}.training")
+    symmetry = by_folds and chosen.physics.symmetry == "auto"
+    campaign = open_campaign(source_of(dataset, hierarchy), test, symmetry=symmetry)
+    state = None if folder is None else folder.with_name(f".{folder.name}.training")
     with (
+        tempfile.TemporaryDirectory(prefix="crashkit-") as scratch,
         _processes(device) as first,
         _enough_threads(largest_product(chosen, campaign)),
         _tensorboard(tensorboard if first else None) as note,
     ):
-        keeper = Checkpoints(state, chosen, campaign, every=checkpoint_every, resume=resume)
+        keeper = Checkpoints(
+            state or Path(scratch) / "training", chosen, campaign, every=checkpoint_every, resume=resume
+        )
 
         def tell(epoch: Epoch) -> None:
             note(epoch)
@@ -82,41 +137,21 @@ def train(
         try:
             surrogate = train_surrogate(campaign, chosen, device=device, report=tell, keeper=keeper)
         except SurrogateError as error:
-            if first and isinstance(error, Diverged) and error.surrogate is not None:
-                save(error.surrogate, output, overwrite=overwrite)
+            if first and folder is not None and isinstance(error, Diverged) and error.surrogate is not None:
+                save(error.surrogate, folder, overwrite=overwrite)
             if first and not resume:
                 keeper.discard()
             raise
-        if first:
-            save(surrogate, output, overwrite=overwrite)
+        if first and folder is not None:
+            save(surrogate, folder, overwrite=overwrite)
             if not interrupted(surrogate):
                 keeper.discard()
-    return surrogate
+    return Model(surrogate, folder)
 
 
 def interrupted(surrogate: Surrogate) -> bool:
     """Whether the training was ended early by Ctrl-C: its state is kept, so that --resume can go on."""
     return any(fit.status == "interrupted" for fit in surrogate.record.fits.values())
-
-
-def check_output(output: Path, overwrite: bool) -> None:
-    """Raise OutputError if a model cannot be stored as the folder `output`: better now than after the training."""
-    import os
-
-    from crashkit.errors import OutputError
-
-    if output.exists():
-        if not output.is_dir() or (any(output.iterdir()) and not (output / "model.json").exists()):
-            raise OutputError(f"{output}: exists and is no model folder; choose another place with -o")
-        if not overwrite and any(output.iterdir()):
-            raise OutputError(f"{output}: holds a model already; replace it with --overwrite, or choose another place")
-    home = output.absolute().parent
-    try:
-        home.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{output}: cannot be written ({error.strerror}); choose another place with -o") from error
-    if not os.access(home, os.W_OK | os.X_OK):
-        raise OutputError(f"{output}: cannot be written (no permission in {home}); choose another place with -o")
 
 
 # Below this many numbers in the largest array of a step, handing work to a second thread costs more than it saves: a

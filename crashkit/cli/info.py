@@ -39,7 +39,7 @@ def command(
         from crashkit.api.predict import load_model
 
         with Progress(f"reading {path}", quiet=as_json):
-            found = describe_model(load_model(path), path)
+            found = describe_model(load_model(path).surrogate, path)
         print_json(found) if as_json else _print_model(found)
     elif (path / "report.json").exists():
         from crashkit.api.describe import describe_report

@@ -76,23 +76,23 @@ def command(
     asked = _given(param or ())
     times = _times(time)
     with Progress(f"reading {model}", quiet=json) as shown:
-        from crashkit.api.predict import as_dataset, beside_truth, further_arrays, load_model, predict, write_prediction
+        from crashkit.api.predict import beside_truth, load_model, write_prediction
 
-        surrogate = load_model(model)
+        loaded = load_model(model)
+        surrogate = loaded.surrogate
         rows = []
         for name, values, target, true in _wanted(surrogate, asked, params, run, dataset, output):
             shown.stage(f"predicting {name or model}")
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)
-                found = predict(
-                    surrogate, values, times if true is None or times else true["time"].values, level,
-                    full or None, extrapolate=extrapolate,
+                prediction = loaded.predict(
+                    values, times if true is None or times else true["time"].values, level,
+                    full or None, extrapolate=extrapolate, band=band, sensitivity=sensitivity,
                 )  # fmt: skip
-            prediction = as_dataset(surrogate, found, further_arrays(surrogate, found, band, sensitivity))
             if true is not None:
                 prediction = beside_truth(prediction, true)
             about = {
-                "model_name": f"{found.attrs['model']} of {model.resolve().name}",
+                "model_name": f"{prediction.attrs['model']} of {model.resolve().name}",
                 **({"run": name} if name else {}),
             }
             rows.append(_row(name, prediction, write_prediction(prediction, target, about), surrogate, true))

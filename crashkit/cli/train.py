@@ -54,15 +54,12 @@ def command(
     given = list(settings or ())
     if odd:
         given.append(f"physics.odd=[{odd}]")
-    if epochs is not None:
-        given += [f"level.epochs={epochs}", "transfer.epochs=1"]
-    if seed is not None:
-        given.append(f"seed={seed}")
     with Progress(f"reading {dataset}", quiet=json) as shown:
         surrogate = train(
-            dataset, output, model or None, config, given, preset=preset or None, test=test or None, device=device,
-            resume=resume, overwrite=overwrite, tensorboard=tensorboard, report=epoch_lines(shown, verbose),
-        )  # fmt: skip
+            dataset, output, model or None, preset=preset or None, settings=given, config=config, seed=seed,
+            epochs=epochs, test=test or None, device=device, resume=resume, overwrite=overwrite,
+            tensorboard=tensorboard, report=epoch_lines(shown, verbose),
+        ).surrogate  # fmt: skip
     if json:
         print_json(_as_json(surrogate, output))
         return

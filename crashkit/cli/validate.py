@@ -21,15 +21,10 @@ def command(
     """Check a dataset against the schema and its checksums; list what is wrong and exit with 1 if anything is."""
     from dataclasses import asdict
 
-    from crashkit.dataset import open_dataset, reading_dataset
-    from data_schema import validate
+    from crashkit.api.validate import validate
 
-    with (
-        Progress(f"checking {path}", quiet=as_json),
-        open_dataset(path, chunks=None) as dataset,
-        reading_dataset(path),
-    ):
-        violations = validate(dataset, values=not quick)
+    with Progress(f"checking {path}", quiet=as_json):
+        violations = validate(path, values=not quick)
     if as_json:
         print_json({"path": path, "valid": not violations, "violations": [asdict(v) for v in violations]})
     else:

@@ -204,10 +204,15 @@ def open_mesh(path: Path) -> MeshArrays:
         If the file is no crash dataset or lacks its faces.
     """
     with open_dataset(path, chunks=None) as dataset:
-        at = dataset["reference_position"]
-        at = at.isel(sim=0) if "sim" in at.dims else at
-        others = (dataset[name].values for name in ("face_nodes", "face_part", "node_id", "part_id"))
-        return MeshArrays(np.asarray(at.values, np.float64), *others)
+        return mesh_of(dataset)
+
+
+def mesh_of(dataset: xr.Dataset) -> MeshArrays:
+    """The mesh of a dataset; where the runs differ in shape, the one of the first run."""
+    at = dataset["reference_position"]
+    at = at.isel(sim=0) if "sim" in at.dims else at
+    others = (dataset[name].values for name in ("face_nodes", "face_part", "node_id", "part_id"))
+    return MeshArrays(np.asarray(at.values, np.float64), *others)
 
 
 def parts_without_faces(path: Path) -> list[str]:

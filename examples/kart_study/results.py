@@ -101,7 +101,7 @@ def learning_curves(home: Path, test: TestRuns, shape: Callable[[Kind], Kind]) -
     sizes, errors = (*SIZES, TRAIN), {}
     for kind in CURVES:
         for runs in sizes:
-            model = crashkit.load_model(home / Job(shape(kind), 0, runs).folder)
+            model = crashkit.load_model(home / Job(shape(kind), 0, runs).folder).surrogate
             for name, level in model.level_names.items():
                 found = test.error(lambda p, m=model, k=level: m.predict_full(p, level=k))
                 errors.setdefault(name.split(" ")[0], []).append(found)
@@ -110,7 +110,7 @@ def learning_curves(home: Path, test: TestRuns, shape: Callable[[Kind], Kind]) -
 
 def averaged(home: Path, test: TestRuns, seeds: int, kinds: Sequence[Kind]) -> float:
     """e2, m, of the mean prediction of `kinds`, all their seeds, each on its finest level."""
-    models = [crashkit.load_model(home / Job(kind, seed).folder) for kind in kinds for seed in range(seeds)]
+    models = [crashkit.load_model(home / Job(kind, seed).folder).surrogate for kind in kinds for seed in range(seeds)]
     return test.error(lambda p: np.mean([m.predict_full(p) for m in models], axis=0))
 
 
@@ -142,8 +142,8 @@ def timed_alone(home: Path, rows: Sequence[Mapping[str, Any]], shape: Callable[[
     """
     each, whole = {}, {row["model"].split(" ")[0]: row["training_s"] for row in rows}
     for kind in (k for k in TABLE if k.model in NETWORKS):
-        timed = crashkit.load_model(home / Job(alone(kind)).folder)
-        trained, total = crashkit.load_model(home / Job(shape(kind)).folder), 0.0
+        timed = crashkit.load_model(home / Job(alone(kind)).folder).surrogate
+        trained, total = crashkit.load_model(home / Job(shape(kind)).folder).surrogate, 0.0
         for name, level in timed.level_names.items():  # coarsest first
             each[name] = timed.record.fits[level].seconds / timed.record.fits[level].epochs
             total += each[name] * trained.record.fits[level].epochs
@@ -192,7 +192,7 @@ def write_results(data: Path, home: Path, seeds: int, short: bool) -> list[Path]
     errors[MEAN] = 100 * averaged(home, test, seeds, [mh])
     errors[MEAN_OF_BOTH] = 100 * averaged(home, test, seeds, [mh, gpr])
     if not short:
-        models = [crashkit.load_model(home / Job(MH_ALL, seed).folder) for seed in range(seeds)]
+        models = [crashkit.load_model(home / Job(MH_ALL, seed).folder).surrogate for seed in range(seeds)]
         errors[ALL] = 100 * float(np.mean([test.error(m.predict_full) for m in models]))
         errors[MEAN_OF_ALL] = 100 * averaged(home, test, seeds, [MH_ALL])
     tables = {

@@ -39,6 +39,10 @@ class Network(nn.Module):
         """Displacements of level `number` for parameters (b, p) and time (b,), s."""
         raise NotImplementedError
 
+    def encode_metres(self, x: Tensor, number: int) -> Tensor:
+        """States of level `number`, m -> latent vectors (b, latent)."""
+        raise NotImplementedError
+
     def reconstruct(self, x: Tensor, number: int) -> Tensor:
         """Encode and decode."""
         raise NotImplementedError

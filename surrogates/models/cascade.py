@@ -52,9 +52,13 @@ class Cascade(Network):
         level = self.levels[number]
         return in_metres(level.decode(level.regress(self.inputs(parameters, time))), level.scale)
 
+    def encode_metres(self, x: Tensor, number: int) -> Tensor:
+        level = self.levels[number]
+        return level.encode(x / level.scale)
+
     def reconstruct(self, x: Tensor, number: int) -> Tensor:
         level = self.levels[number]
-        return in_metres(level.decode(level.encode(x / level.scale)), level.scale)
+        return in_metres(level.decode(self.encode_metres(x, number)), level.scale)
 
     def n_parameters(self, number: int) -> int:
         return sum(sum(v.parameter_counts().values()) for k, v in self.levels.items() if k >= number)

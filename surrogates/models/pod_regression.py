@@ -107,8 +107,11 @@ class PodRegression:
 
     def reconstruct(self, states: NDArray[np.float32], number: int = 0) -> NDArray[np.float32]:
         """(state, node, 3) projected on the modes."""
-        flat = np.asarray(states, np.float32).reshape(len(states), -1)
-        return np.asarray((flat @ self.modes) @ self.modes.T, np.float32).reshape(states.shape)
+        return np.asarray(self.encode(states) @ self.modes.T, np.float32).reshape(states.shape)
+
+    def encode(self, states: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(state, node, 3) -> (state, mode): coefficients of the modes."""
+        return np.asarray(np.asarray(states, np.float32).reshape(len(states), -1) @ self.modes, np.float32)
 
     def n_parameters(self, number: int = 0) -> int:
         """Modes, the coefficients they are predicted from, and the kernel's numbers."""

@@ -101,12 +101,15 @@ class Unified(Network):
     def forward(self, parameters: Tensor, time: Tensor, number: int) -> Tensor:
         return in_metres(self.decode_all(self.regress(self.inputs(parameters, time)), number)[number], self.scale)
 
-    def reconstruct(self, x: Tensor, number: int) -> Tensor:
-        """Encode and decode; a coarse state is lifted to the finest level by the static U first."""
+    def encode_metres(self, x: Tensor, number: int) -> Tensor:
+        """A coarse state is lifted to the finest level by the static U first."""
         if number != self._numbers[-1]:
             up = self.to_finest[number].astype("float32")
             x = torch.from_numpy((up @ x.reshape(len(x), -1).numpy()).reshape(-1, *x.shape[1:]))
-        return in_metres(self.decode_all(self.encode(x / self.scale), number)[number], self.scale)
+        return self.encode(x / self.scale)
+
+    def reconstruct(self, x: Tensor, number: int) -> Tensor:
+        return in_metres(self.decode_all(self.encode_metres(x, number), number)[number], self.scale)
 
     def n_parameters(self, number: int) -> int:
         needed = [k for k in self._numbers if k >= number]

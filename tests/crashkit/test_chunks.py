@@ -11,6 +11,7 @@ import pytest
 from crashkit.api.campaign import open_campaign
 from crashkit.api.coarsen import coarsen
 from crashkit.api.describe import describe_dataset
+from crashkit.api.source import source_of
 from crashkit.dataset import open_dataset, reading_dataset
 from crashkit.errors import ReadError
 from crashkit.mesh.store import level_displacement
@@ -27,7 +28,7 @@ def read_all(path: Path) -> None:
     """Everything that info, coarsen, train and evaluate read."""
     with open_dataset(path, chunks=None) as dataset, reading_dataset(path):
         describe_dataset(dataset, path)
-    campaign = open_campaign(path)
+    campaign = open_campaign(source_of(path))
     for run in range(len(campaign.runs)):
         campaign.displacement(0)[run]
     level_displacement(path, 2)

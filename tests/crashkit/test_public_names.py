@@ -56,7 +56,7 @@ def test_the_accessor_is_there_whatever_is_imported_first(
 
 @pytest.mark.parametrize("first", ["data_schema", "crashkit.dataset", "crashkit.engine", "crashkit.ingestion.ingest"])
 def test_whatever_brings_xarray_in_brings_the_accessor_too(first: str) -> None:
-    said = python(f"import crashkit, {first}, sys; xr = sys.modules['xarray']; print(xr.Dataset.crash.__name__)")
+    said = python(f"import crashkit, {first}, xarray as xr; print(xr.Dataset.crash.__name__)")
     assert said == "CrashAccessor"
 
 

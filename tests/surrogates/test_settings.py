@@ -59,7 +59,10 @@ def test_settings_cannot_be_changed() -> None:
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["level.epoch=3"], r"level\.epoch is not a setting; there are .*epochs"),
+        (["level.epoch=3"], r"level\.epoch is not a setting; did you mean level\.epochs\? there are .*latent"),
+        (["epochs=3"], r"epochs is not a setting; did you mean level\.epochs\?"),
+        (["at.2.epoch=3"], r"at\.2\.epoch is not a setting; did you mean at\.2\.epochs\?"),
+        ({"level": {"mlp": {"width": [3]}}}, r"level\.mlp\.width is not a setting; did you mean level\.mlp\.widths\?"),
         (["nonsense"], "expected path=value"),
         (["level.epochs=0"], r"level\.epochs = 0"),
         (["level.reduction=pca"], "'gcn', 'ae' or 'pod'"),
@@ -115,3 +118,18 @@ def test_the_documentation_names_every_setting() -> None:
         group = names[0].rpartition(".")[0] if names else ""
         told |= {name if "." in name or not group else f"{group}.{name}" for name in names}
     assert set(paths(Settings)) - {"model", "preset"} - told == set()
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        {"level": {"epochs": 20}, "at": {2: {"latent": 3}}},
+        {"level.epochs": 20, "at.2.latent": 3},
+        {"level": {"epochs": 20}, "at": {"2": {"latent": 3}}},
+        [["level.epochs=5", "at.2.latent=3"], {"level.epochs": 20}],
+    ],
+)
+def test_settings_come_as_dictionaries_too(overrides: object) -> None:
+    shared = {"transfer": {"encoder": "concat"}}
+    chosen = settings("mh", overrides=[overrides, shared])  # type: ignore[list-item]
+    assert (chosen.level.epochs, chosen.for_level(2).latent, chosen.for_level(1).latent) == (20, 3, 16)

@@ -42,8 +42,8 @@ def campaign(tmp_path_factory) -> Path:
     coarsen(folder / "kart.zarr", [60, 16])
     few = ("level.epochs=2", "level.channels=[3,6]")
     for seed in (0, 1):
-        train(folder / "kart.zarr", folder / f"mh{seed}", "mh", overrides=(*few, f"seed={seed}"), test="5:8")
-    train(folder / "kart.zarr", folder / "podnn", "podnn", overrides=("level.epochs=2",), test="5:8")
+        train(folder / "kart.zarr", folder / f"mh{seed}", "mh", settings=(*few, f"seed={seed}"), test="5:8")
+    train(folder / "kart.zarr", folder / "podnn", "podnn", settings=("level.epochs=2",), test="5:8")
     return folder
 
 
@@ -83,7 +83,7 @@ def test_numbers_are_those_of_asking_the_model(campaign, small, tmp_path):
     from crashkit.api.predict import load_model
 
     result = evaluate(campaign / "kart.zarr", [campaign / "podnn"], tmp_path / "report")
-    model, data = load_model(campaign / "podnn"), open_dataset(campaign / "kart.zarr")
+    model, data = load_model(campaign / "podnn").surrogate, open_dataset(campaign / "kart.zarr")
     errors = []
     for sim in (5, 6, 7):
         one = data.isel(sim=sim)

@@ -27,7 +27,7 @@ def crash(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_two_processes_have_the_losses_of_one(crash: Path, tmp_path: Path) -> None:
     chosen = ["level.epochs=3", "transfer.epochs=1", "level.batch=16"]
-    alone = crashkit.train(crash, tmp_path / "alone", "mh", overrides=chosen, test="8:10", device="cpu")
+    alone = crashkit.train(crash, tmp_path / "alone", "mh", settings=chosen, test="8:10", device="cpu").surrogate
     command = [
         sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2", "-m", "crashkit",
         "train", str(crash), "-o", str(tmp_path / "shared"), "--test", "8:10", "--device", "cpu", "--json",
@@ -49,11 +49,11 @@ def test_losses_and_rate_go_to_tensorboard(crash: Path, tmp_path: Path) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     trained = crashkit.train(
-        crash, tmp_path / "m", "podnn", overrides=["level.epochs=3"], test="8:10", device="cpu",
+        crash, tmp_path / "m", "podnn", settings=["level.epochs=3"], test="8:10", device="cpu",
         tensorboard=tmp_path / "board",
     )  # fmt: skip
     board = EventAccumulator(str(tmp_path / "board")).Reload()
     names = {"total", "approximation", "reconstruction", "validation", "learning_rate"}
     assert set(board.Tags()["scalars"]) == {f"PODNN/{name}" for name in names}
     values = [event.value for event in board.Scalars("PODNN/total")]
-    np.testing.assert_allclose(values, trained.history(0)["total"], rtol=1e-6)
+    np.testing.assert_allclose(values, trained.surrogate.history(0)["total"], rtol=1e-6)

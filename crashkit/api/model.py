@@ -1,0 +1,337 @@
+"""A trained model as people ask it: parameters by name, labelled arrays out, which can be drawn."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+    import xarray as xr
+    from numpy.typing import ArrayLike, NDArray
+
+    from surrogates.record import Record
+    from surrogates.settings import Settings
+    from surrogates.surrogate import Surrogate
+
+
+class Model:
+    """A trained surrogate, as `crashkit.train` and `crashkit.load_model` return it.
+
+    Attributes
+    ----------
+    surrogate : surrogates.surrogate.Surrogate
+        The arrays-only core: everything this class does, without labels.
+    folder : Path or None
+        Where it is stored, if it is.
+    """
+
+    def __init__(self, surrogate: Surrogate, folder: Path | None = None) -> None:
+        self.surrogate = surrogate
+        self.folder = folder
+
+    @property
+    def name(self) -> str:
+        """The name of its folder, or of the kind of model where it is not stored."""
+        return self.surrogate.settings.model if self.folder is None else self.folder.resolve().name
+
+    @property
+    def settings(self) -> Settings:
+        """The settings it was trained with."""
+        return self.surrogate.settings
+
+    @property
+    def record(self) -> Record:
+        """How its training went: runs, ranges, errors, versions."""
+        return self.surrogate.record
+
+    @property
+    def levels(self) -> dict[str, int]:
+        """Name of each level it predicts on and the mesh level, coarsest first: {"MH3": 3, "MH2": 2, "MH1": 1}."""
+        return self.surrogate.level_names
+
+    @property
+    def parameters(self) -> dict[str, tuple[float, float, str]]:
+        """Each parameter with its trained range and unit: {"impact_speed": (10.0, 30.0, "m s-1")}."""
+        ranges = self.record.ranges
+        spans = zip(ranges.names, ranges.low, ranges.high, ranges.units, strict=True)
+        return {name: (float(low), float(high), unit) for name, low, high, unit in spans}
+
+    @property
+    def time(self) -> NDArray[np.float64]:
+        """(state,) times of the training runs, s."""
+        return self.record.time
+
+    def predict(
+        self,
+        parameters: Mapping[str, Any],
+        time: ArrayLike | None = None,
+        level: int | None = None,
+        full: bool | None = None,
+        *,
+        extrapolate: bool = False,
+        band: float | None = None,
+        sensitivity: bool = False,
+    ) -> xr.Dataset:
+        """Displacements of one run, or of several.
+
+        Parameters
+        ----------
+        parameters
+            Values by name: numbers in the dataset's unit (SI), or text, with a unit ("400MPa") or in the unit in which
+            the parameter's table was written ("400"). A list or an array for a parameter asks for several runs at
+            once; all lists have one length.
+        time
+            s; without it the states of the training runs.
+        level
+            A mesh level of the model, on its own nodes; without it all nodes of the mesh, from the finest level.
+        full
+            With `level`: on all nodes of the mesh, interpolated from that level.
+        extrapolate
+            Also far outside the trained range: by more than a quarter of it.
+        band
+            Also `half_width`, m: this share (0.9) of nodes and states is as close to the truth, as far as the
+            validation runs tell.
+        sensitivity
+            Also `displacement_by_NAME`: the derivative by each parameter. For one run.
+
+        Returns
+        -------
+        xarray.Dataset
+            `displacement` (time, node, xyz), m, with `sim` in front for several runs; the parameters; and the mesh, so
+            that `prediction.crash.to_pyvista(time=0.02).plot()` draws it. The coordinate `node` says which node of
+            the full mesh each one is. Attributes: `model`, `level`, and `warnings`: what lies outside the trained
+            range, of which there is a Python warning, too.
+
+        Raises
+        ------
+        DataError
+            For parameters that are unknown, missing or no numbers, and far outside the trained range unless
+            `extrapolate`.
+        SurrogateError
+            For a level the model does not have; with `band`, where too few validation runs were held out.
+        """
+        import numpy as np
+        import xarray as xr
+
+        from crashkit.api.parameters import parameter_table
+        from crashkit.errors import DataError
+        from surrogates.data.inputs import far_outside
+
+        surrogate, ranges = self.surrogate, self.record.ranges
+        values, several = parameter_table(parameters, ranges)
+        at = self.time if time is None else np.atleast_1d(np.asarray(time, np.float64))
+        number = surrogate.number(level)
+        full = level is None if full is None else full
+        outside = list(dict.fromkeys(sentence for row in values for sentence in surrogate.outside(row, at)))
+        far = set() if extrapolate else {name for row in values for name in far_outside(ranges, row[None], at)}
+        if far:
+            said = "; ".join(s for s in outside if s.split(" = ")[0] in far)
+            raise DataError(
+                f"{said}: that is far outside, and nothing is known there; check the value and its unit, or extrapolate "
+                "with --extrapolate"
+            )
+        if sensitivity and len(values) > 1:
+            raise DataError(f"sensitivities are those of one run; found parameters of {len(values)}")
+        u = surrogate.predict_full(values, at, number) if full else surrogate.predict(values, at, number)
+        if not np.isfinite(u).all():
+            raise DataError("the model gives numbers that are not finite for these parameters; train it again")
+        for sentence in outside:
+            warnings.warn(sentence, stacklevel=2)
+        arrays: dict[str, tuple[NDArray[Any], str]] = {"displacement": (u, "m")}
+        if band is not None:
+            widths = [surrogate.band(band, at, number, full=full, parameters=row) for row in values]
+            arrays["half_width"] = (np.stack(widths), "m")
+        if sensitivity:
+            slopes = surrogate.sensitivity(values[0], at, number)
+            for k, (name, unit) in enumerate(zip(ranges.names, ranges.units, strict=True)):
+                slope = np.ascontiguousarray(slopes[..., k])
+                slope = surrogate.lift(slope, number) if full else slope
+                arrays[f"displacement_by_{name}"] = (slope[None], f"m ({unit})-1")
+        out = xr.Dataset(
+            {
+                **{
+                    name: (("sim", "time", "node", "xyz")[: array.ndim], array, {"units": unit, **_role(name)})
+                    for name, (array, unit) in arrays.items()
+                },
+                **{
+                    name: ("sim", values[:, k], {"units": unit, "table_units": written, "role": "parameter"})
+                    for k, (name, unit, (written, _)) in enumerate(
+                        zip(ranges.names, ranges.units, ranges.written, strict=True)
+                    )
+                },
+                **self._mesh(0 if full else number),
+            },
+            coords={
+                "time": ("time", at, {"units": "s"}),
+                "node": ("node", surrogate.graphs.kept(0 if full else number)),
+            },
+            attrs={
+                "model": next(name for name, k in self.levels.items() if k == number),
+                "level": 0 if full else number,
+                "warnings": "; ".join(outside),
+            },
+        )
+        if not several:
+            return out.isel(sim=0)
+        return out.assign_coords(sim=[f"prediction_{k}" for k in range(len(values))])
+
+    def encode(self, states: xr.Dataset | xr.DataArray | ArrayLike, level: int | None = None) -> xr.DataArray:
+        """Latent vectors of displacements.
+
+        Parameters
+        ----------
+        states
+            A crash dataset, its `displacement`, or an array (state, node, 3), m; on the full mesh or on the level's
+            own nodes. Dimensions before `node` (sim, time) are kept.
+        level
+            A mesh level of the model; without it the finest it has.
+
+        Returns
+        -------
+        xarray.DataArray
+            (..., latent), with the coordinates of what was given.
+        """
+        import xarray as xr
+
+        given, labelled = self._on_level(states, level)
+        *before, _, _ = labelled.dims
+        latent = self.surrogate.encode(given, level)
+        out = latent.reshape(*labelled.shape[:-2], -1)
+        coords = {k: v for k, v in labelled.coords.items() if set(v.dims) <= set(before)}
+        return xr.DataArray(out, dims=(*before, "latent"), coords=coords, name="latent")
+
+    def reconstruct(self, states: xr.Dataset | xr.DataArray | ArrayLike, level: int | None = None) -> xr.DataArray:
+        """Displacements encoded and decoded: what the reduction alone costs.
+
+        Parameters
+        ----------
+        states, level
+            As for `encode`.
+
+        Returns
+        -------
+        xarray.DataArray
+            (..., node of the level, xyz), m.
+        """
+        import xarray as xr
+
+        given, labelled = self._on_level(states, level)
+        *before, _, _ = labelled.dims
+        back = self.surrogate.reconstruct(given, level)
+        coords = {k: v for k, v in labelled.coords.items() if set(v.dims) <= set(before)}
+        coords["node"] = ("node", self.surrogate.graphs.kept(self.surrogate.number(level)))
+        return xr.DataArray(
+            back.reshape(*labelled.shape[:-2], *back.shape[1:]), dims=(*before, "node", "xyz"), coords=coords,
+            name="displacement", attrs={"units": "m"},
+        )  # fmt: skip
+
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
+        """Store the model as `folder`, from which `crashkit.load_model` brings it back.
+
+        Raises
+        ------
+        OutputError
+            Where the folder holds something already, or cannot be written.
+        """
+        from crashkit.output import check_model_folder
+        from surrogates.storage.folder import save
+
+        folder = Path(folder)
+        check_model_folder(folder, overwrite)
+        save(self.surrogate, folder, overwrite=overwrite)
+        self.folder = folder
+        return folder
+
+    def _on_level(
+        self, states: xr.Dataset | xr.DataArray | ArrayLike, level: int | None
+    ) -> tuple[NDArray[np.float32], xr.DataArray]:
+        """States as (state, node of the level, 3), and with their labels (..., node, xyz)."""
+        import numpy as np
+        import xarray as xr
+
+        from crashkit.errors import DataError
+
+        if isinstance(states, xr.Dataset):
+            states = states["displacement"]
+        if not isinstance(states, xr.DataArray):
+            array = np.asarray(states)
+            if array.ndim < 2:
+                raise DataError(f"states have the shape {array.shape}; expected (state, node, 3)")
+            states = xr.DataArray(array, dims=("sim", "time", "node", "xyz")[-array.ndim :])
+        if states.dims[-2:] != ("node", "xyz"):
+            raise DataError(f"states have the dimensions {states.dims}; expected (..., node, xyz)")
+        graphs, number = self.surrogate.graphs, self.surrogate.number(level)
+        if number and states.sizes["node"] == graphs.n_nodes(0) != graphs.n_nodes(number):
+            states = states.isel(node=graphs.kept(number))
+        flat = np.asarray(states.values, np.float32).reshape(-1, *states.shape[-2:])
+        return flat, states
+
+    def _mesh(self, level: int) -> dict[str, Any]:
+        """The mesh of a level as variables of a dataset; nothing where the model was stored without."""
+        import numpy as np
+
+        from data_schema.edges import without_sides
+
+        surrogate = self.surrogate
+        if surrogate.points is None or surrogate.faces is None:
+            return {}
+        faces = surrogate.graphs[level].faces if level else surrogate.faces
+        out: dict[str, Any] = {
+            "reference_position": (("node", "xyz"), surrogate.points[surrogate.graphs.kept(level)], {"units": "m"}),
+            "face_nodes": (("face", "corner"), faces),
+        }
+        labels = surrogate.labels
+        if labels is not None:
+            out["node_id"] = ("node", labels.node_id[surrogate.graphs.kept(level)])
+            if not level:
+                out["face_part"], out["part_id"] = ("face", labels.face_part), ("part", labels.part_id)
+                out["part_name"] = ("part", np.array(labels.part_name, dtype=str))
+                if labels.face_id is not None:
+                    out["face_id"] = ("face", labels.face_id)
+        if level:
+            out["line_nodes"] = (("line", "end"), without_sides(surrogate.graphs[level].edges, faces))
+        return out
+
+    def _facts(self) -> tuple[str, dict[str, object], tuple[str, ...], list[tuple[object, ...]]]:
+        from crashkit.display import listed
+
+        record, settings = self.record, self.settings
+        spans = (f"{name} {low:.4g} to {high:.4g} {unit}" for name, (low, high, unit) in self.parameters.items())
+        facts: dict[str, object] = {
+            "dataset": f"{record.attributes.get('dataset') or 'not recorded'}, checksum {record.checksum[:12] or 'none'}",
+            "parameters": listed(spans),
+            "states": f"{len(self.time)} from {self.time[0]:.4g} to {self.time[-1]:.4g} s",
+            "runs": f"{len(record.fitted_runs)} training, {len(record.validation_runs)} validation, "
+            f"{len(record.held_out_runs)} held out",
+        }
+        rows: list[tuple[object, ...]] = [
+            (
+                name, self.surrogate.graphs.n_nodes(level), self.surrogate.n_latent(level),
+                self.surrogate.n_parameters(level), _centimetres(record.errors.get(name)),
+            )
+            for name, level in self.levels.items()
+        ]  # fmt: skip
+        title = f"crashkit.Model {self.name}: {settings.model}, preset {settings.preset}, seed {record.seed}"
+        return title, facts, ("level", "nodes", "latent", "parameters", "validation error (cm)"), rows
+
+    def __repr__(self) -> str:
+        from crashkit.display import as_text
+
+        return as_text(*self._facts())
+
+    def _repr_html_(self) -> str:
+        from crashkit.display import as_html
+
+        return as_html(*self._facts())
+
+
+def _centimetres(error: float | None) -> str:
+    return "-" if error is None else f"{100 * error:.2f}"
+
+
+def _role(name: str) -> dict[str, str]:
+    """Further results are fields of a crash dataset, which writers and drawings know."""
+    return {} if name == "displacement" else {"role": "field"}

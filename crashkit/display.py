@@ -1,0 +1,46 @@
+"""What an object says of itself, at a prompt and in a notebook: a title, facts, and perhaps a table."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterable, Mapping, Sequence
+
+Facts = Mapping[str, object]
+Rows = Sequence[Sequence[object]]
+
+
+def as_text(title: str, facts: Facts, columns: Sequence[str] = (), rows: Rows = ()) -> str:
+    """A title, a line a fact, and the rows below their columns, aligned."""
+    width = max(map(len, facts), default=0)
+    lines = [title, *(f"  {name:<{width}}  {value}" for name, value in facts.items())]
+    if rows:
+        cells = [list(columns), *([str(cell) for cell in row] for row in rows)]
+        widths = [max(len(row[k]) for row in cells) for k in range(len(columns))]
+        lines += ["  " + "  ".join(_aligned(row, widths)) for row in cells]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def as_html(title: str, facts: Facts, columns: Sequence[str] = (), rows: Rows = ()) -> str:
+    """The same for a notebook; every text is escaped."""
+    out = [f"<div><strong>{html.escape(title)}</strong>"]
+    if facts:
+        out.append("<table>" + "".join(_row("th", [name], "td", [value]) for name, value in facts.items()) + "</table>")
+    if rows:
+        head, body = _row("th", columns), "".join(_row("td", row) for row in rows)
+        out.append(f"<table><thead>{head}</thead><tbody>{body}</tbody></table>")
+    return "".join([*out, "</div>"])
+
+
+def listed(names: Iterable[object], most: int = 6) -> str:
+    """Names with commas; of many the first, and how many more there are."""
+    known = [str(name) for name in names]
+    return ", ".join(known[:most]) + (f" and {len(known) - most} more" if len(known) > most else "") or "none"
+
+
+def _aligned(row: Sequence[str], widths: Sequence[int]) -> list[str]:
+    return [f"{cell:<{width}}" if k == 0 else f"{cell:>{width}}" for k, (cell, width) in enumerate(zip(row, widths))]
+
+
+def _row(kind: str, cells: Sequence[object], other: str = "", others: Sequence[object] = ()) -> str:
+    pieces = [(kind, cell) for cell in cells] + [(other, cell) for cell in others]
+    return "<tr>" + "".join(f"<{tag}>{html.escape(str(cell))}</{tag}>" for tag, cell in pieces) + "</tr>"
