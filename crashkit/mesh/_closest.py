@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from crashkit.mesh._compiled import compiled
 
-@njit(cache=True)
+
+@compiled
 def _on_segment(points: NDArray, i: int, at: NDArray, a: int, b: int) -> float:
     """Weight of b at the point of the segment a-b closest to point i."""
     along = 0.0
@@ -21,7 +22,7 @@ def _on_segment(points: NDArray, i: int, at: NDArray, a: int, b: int) -> float:
     return min(1.0, max(0.0, along / length2))
 
 
-@njit(cache=True)
+@compiled
 def _to_segment2(points: NDArray, i: int, at: NDArray, a: int, b: int, t: float) -> float:
     """Squared distance of point i to the point (1 - t) a + t b."""
     total = 0.0
@@ -31,7 +32,7 @@ def _to_segment2(points: NDArray, i: int, at: NDArray, a: int, b: int, t: float)
     return total
 
 
-@njit(cache=True)
+@compiled
 def closest_weights(
     points: NDArray, i: int, at: NDArray, cells: NDArray, cell: int
 ) -> tuple[float, float, float, float]:
@@ -79,7 +80,7 @@ def closest_weights(
     return t2, 0.0, 1.0 - t2, d2
 
 
-@njit(cache=True)
+@compiled
 def settle(
     points: NDArray, start: NDArray, candidate: NDArray, at: NDArray, cells: NDArray, cell_start: NDArray,
     cell_list: NDArray, near_start: NDArray, near_list: NDArray, hops: int,

@@ -7,13 +7,14 @@ faces and graph edges hang in linked lists, and every vertex waits in one binary
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from crashkit.mesh._compiled import compiled
 
 _NONE = -1
 
 
-@njit(cache=True)
+@compiled
 def _evaluate(q: NDArray, x: float, y: float, z: float) -> float:
     """v^T Q v of a quadric stored as xx xy xz xw yy yz yw zz zw ww."""
     return (
@@ -23,14 +24,14 @@ def _evaluate(q: NDArray, x: float, y: float, z: float) -> float:
     )  # fmt: skip
 
 
-@njit(cache=True)
+@compiled
 def _less(cost: NDArray, tie: NDArray, a: int, b: int) -> bool:
     if cost[a] != cost[b]:
         return cost[a] < cost[b]
     return tie[a] < tie[b]
 
 
-@njit(cache=True)
+@compiled
 def _sift_down(heap: NDArray, where: NDArray, cost: NDArray, tie: NDArray, k: int, size: int) -> None:
     v = heap[k]
     while True:
@@ -48,7 +49,7 @@ def _sift_down(heap: NDArray, where: NDArray, cost: NDArray, tie: NDArray, k: in
     where[v] = k
 
 
-@njit(cache=True)
+@compiled
 def _sift(heap: NDArray, where: NDArray, cost: NDArray, tie: NDArray, k: int, size: int) -> None:
     """Put the entry at place k of the first `size`, whose cost changed, where it belongs."""
     v = heap[k]
@@ -64,7 +65,7 @@ def _sift(heap: NDArray, where: NDArray, cost: NDArray, tie: NDArray, k: int, si
     _sift_down(heap, where, cost, tie, k, size)
 
 
-@njit(cache=True)
+@compiled
 def _flips(
     p: int, q: int, position: NDArray, faces: NDArray, face_head: NDArray, face_next: NDArray
 ) -> int:  # fmt: skip
@@ -102,7 +103,7 @@ def _flips(
     return count
 
 
-@njit(cache=True)
+@compiled
 def _holds_all(parts: NDArray, p: int, q: int) -> bool:
     """Whether q lies on every part that p lies on."""
     for w in range(parts.shape[1]):  # noqa: SIM110 - numba compiles no generator here
@@ -111,7 +112,7 @@ def _holds_all(parts: NDArray, p: int, q: int) -> bool:
     return True
 
 
-@njit(cache=True)
+@compiled
 def _best(
     p: int, position: NDArray, quadric: NDArray, faces: NDArray, face_head: NDArray, face_next: NDArray,
     half_to: NDArray, half_head: NDArray, half_next: NDArray, parts: NDArray, join_parts: bool, flip: float,
@@ -132,7 +133,7 @@ def _best(
     return best, target
 
 
-@njit(cache=True)
+@compiled
 def _unlink_corner(c: int, faces: NDArray, face_head: NDArray, face_next: NDArray) -> None:
     v = faces[c // 3, c % 3]
     at = face_head[v]
@@ -144,7 +145,7 @@ def _unlink_corner(c: int, faces: NDArray, face_head: NDArray, face_next: NDArra
     face_next[at] = face_next[c]
 
 
-@njit(cache=True)
+@compiled
 def _drop_half(v: int, h: int, half_head: NDArray, half_next: NDArray) -> None:
     at = half_head[v]
     if at == h:
@@ -155,7 +156,7 @@ def _drop_half(v: int, h: int, half_head: NDArray, half_next: NDArray) -> None:
     half_next[at] = half_next[h]
 
 
-@njit(cache=True)
+@compiled
 def _has_twin(
     q: int, a: int, b: int, part: int, faces: NDArray, face_part: NDArray, face_head: NDArray, face_next: NDArray
 ) -> bool:  # fmt: skip
@@ -172,7 +173,7 @@ def _has_twin(
     return False
 
 
-@njit(cache=True)
+@compiled
 def contract(
     position: NDArray, quadric: NDArray, faces: NDArray, face_part: NDArray, edges: NDArray, is_pair: NDArray,
     parts: NDArray, tie: NDArray, locked: NDArray, count: int, join_parts: bool, flip: float,
@@ -315,7 +316,7 @@ def contract(
     return into, face_lives, edge_lives
 
 
-@njit(cache=True)
+@compiled
 def graph_distances(
     pairs: NDArray, limit: NDArray, position: NDArray, near_start: NDArray, near_list: NDArray
 ) -> NDArray:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from crashkit.mesh._closest import closest_weights
+from crashkit.mesh._compiled import compiled
 
 
 class Coarse(NamedTuple):
@@ -45,7 +45,7 @@ class Finer(NamedTuple):
     near_list: NDArray
 
 
-@njit(cache=True)
+@compiled
 def _at_least(points: NDArray, x: int, at: NDArray, cells: NDArray, c: int) -> float:
     """Squared distance of x to the box around cell c: cheap, and never more than that to the cell."""
     total = 0.0
@@ -62,7 +62,7 @@ def _at_least(points: NDArray, x: int, at: NDArray, cells: NDArray, c: int) -> f
     return total
 
 
-@njit(cache=True)
+@compiled
 def _closer(
     points: NDArray, parts: NDArray, x: int, at: NDArray, cells: NDArray, cell_part: NDArray, c: int, best: float,
     radius: float,
@@ -92,12 +92,12 @@ def _closer(
     return d2, np.sqrt(d2) + s / (2.0 * radius + np.sqrt(s))
 
 
-@njit(cache=True)
+@compiled
 def _touches(cells: NDArray, c: int, v: int) -> bool:
     return cells[c, 0] == v or cells[c, 1] == v or cells[c, 2] == v
 
 
-@njit(cache=True)
+@compiled
 def _closest_around(x: int, avoid: int, finer: Finer, coarse: Coarse, radius: float) -> tuple[int, float, float]:
     """Closest cell around the vertex of x, none of those at vertex `avoid`: cell, squared distance, cost."""
     best, best_d2, best_cost = -1, np.inf, np.inf
@@ -116,7 +116,7 @@ def _closest_around(x: int, avoid: int, finer: Finer, coarse: Coarse, radius: fl
     return best, best_d2, best_cost
 
 
-@njit(cache=True)
+@compiled
 def _region(p: int, coarse: Coarse) -> NDArray:
     """The finer nodes that belong to p and its neighbours."""
     size = coarse.member_start[p + 1] - coarse.member_start[p]
@@ -133,7 +133,7 @@ def _region(p: int, coarse: Coarse) -> NDArray:
     return out
 
 
-@njit(cache=True)
+@compiled
 def _any_around(p: int, marked: NDArray, coarse: Coarse) -> bool:
     """Whether p or a neighbour is marked."""
     if marked[p]:
@@ -144,7 +144,7 @@ def _any_around(p: int, marked: NDArray, coarse: Coarse) -> bool:
     return False
 
 
-@njit(cache=True)
+@compiled
 def closest_cells_around(finer: Finer, coarse: Coarse, radius: float) -> tuple[NDArray, NDArray, NDArray]:
     """For each finer node the closest cell around its vertex, the squared distance to it and the cost of lifting."""
     cell, d2, cost = np.empty(len(finer.at), np.int64), np.empty(len(finer.at)), np.empty(len(finer.at))
@@ -153,7 +153,7 @@ def closest_cells_around(finer: Finer, coarse: Coarse, radius: float) -> tuple[N
     return cell, d2, cost
 
 
-@njit(cache=True)
+@compiled
 def relocate(
     finer: Finer, coarse: Coarse, chosen: NDArray, stirred: NDArray, radius: float,
     cell: NDArray, d2: NDArray, cost: NDArray,
@@ -212,7 +212,7 @@ def relocate(
     return moved
 
 
-@njit(cache=True)
+@compiled
 def flip_gains(
     finer: Finer, coarse: Coarse, pairs: NDArray, corners: NDArray, stirred: NDArray, radius: float,
     cell: NDArray, d2: NDArray, cost: NDArray,
@@ -252,7 +252,7 @@ def flip_gains(
     return gains
 
 
-@njit(cache=True)
+@compiled
 def _closest_but(x: int, one: int, two: int, finer: Finer, coarse: Coarse, radius: float) -> tuple[float, float]:
     """Squared distance and cost of the closest cell around the vertex of x that is neither `one` nor `two`."""
     best_d2, best_cost = np.inf, np.inf

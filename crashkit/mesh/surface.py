@@ -15,6 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from crashkit.errors import MeshError
 from data_schema.edges import face_edges, unique_pairs
 
+# Diagonals from the origin beyond which a mesh is moved there.
+_FAR = 10
+
 
 @dataclass(frozen=True)
 class Surface:
@@ -94,6 +97,7 @@ def surface(
     if not np.isfinite(at).all():
         node = int(np.argmin(np.isfinite(at).all(axis=1)))
         raise MeshError(f"node {node} has a position that is not finite; expected metres")
+    at = _near_origin(at)
     part = np.zeros(len(corners), np.int32) if face_part is None else np.asarray(face_part, dtype=np.int32)
     if part.shape != (len(corners),) or part.min() < 0:
         raise MeshError(
@@ -111,6 +115,13 @@ def surface(
     if extra_edges is not None:
         edges = _with_extra(edges, np.asarray(extra_edges), used)
     return Surface(at, triangles, triangle_part, edges, used)
+
+
+def _near_origin(at: NDArray[np.float64]) -> NDArray[np.float64]:
+    """`at`, moved to the origin where it lies far away: quadrics square coordinates, and lose what is small beside them."""
+    low, high = at.min(axis=0), at.max(axis=0)
+    middle = (low + high) / 2
+    return at - middle if np.abs(middle).max() > _FAR * np.linalg.norm(high - low) else at
 
 
 def part_sets(n: int, triangles: NDArray[np.int32], part: NDArray[np.int32], n_parts: int) -> NDArray[np.uint64]:

@@ -64,9 +64,13 @@ def to_csv(columns: Columns) -> str:
         raise EvaluationError(f"columns of different length: {lengths}; expected one length for all")
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(columns)
+    writer.writerow(map(_cell, columns))
     writer.writerows([_cell(v) for v in row] for row in zip(*columns.values(), strict=True))
     return out.getvalue()
+
+
+# Spreadsheets compute texts that begin so; names of runs come from strangers.
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
 def _cell(value: Any) -> str:
@@ -74,7 +78,8 @@ def _cell(value: Any) -> str:
         return ""
     if isinstance(value, float) or getattr(getattr(value, "dtype", None), "kind", "") == "f":
         return f"{float(value):.7g}"
-    return str(value)
+    text = str(value)
+    return f"'{text}" if isinstance(value, str) and text.startswith(_FORMULA) else text
 
 
 def image(figure: Figure, form: str, dpi: int = 200) -> bytes:

@@ -61,6 +61,14 @@ def check(campaign: Campaign, settings: Settings, notes: Notes) -> None:
     for name in ranges.constant:
         if runs > 1:
             notes.add(f"parameter {name} has the same value in all training runs; its influence cannot be learnt")
+    first: dict[bytes, int] = {}
+    for run, row in enumerate(campaign.parameters):
+        same = first.setdefault(row.tobytes(), run)
+        if same != run:
+            notes.add(
+                f"runs {_run(campaign, same)} and {_run(campaign, run)} have the same parameters; where their results "
+                f"differ, the model gives something between"
+            )
     if runs == 1:
         notes.add("there is one training run; the model repeats it whatever the parameters")
 

@@ -65,7 +65,7 @@ def card(surrogate: Surrogate) -> str:
         lines.append("None were held out, so there is no independent error here.")
     lines += ["", *_bands(surrogate)]
     lines += ["", "## Data", "", f"- dataset checksum (SHA-256): `{record.checksum or 'not recorded'}`"]
-    lines += [f"- {key}: {value}" for key, value in record.attributes.items()]
+    lines += [f"- {_plain(key)}: {_plain(value)}" for key, value in record.attributes.items()]
     lines += [
         f"- {len(record.fitted_runs)} training runs: {_runs(record.fitted_runs)}",
         f"- {len(record.validation_runs)} validation runs: {_runs(record.validation_runs)}",
@@ -73,7 +73,7 @@ def card(surrogate: Surrogate) -> str:
         "",
     ]
     if record.notes:
-        lines += ["## Notes", "", *(f"- {note}" for note in record.notes), ""]
+        lines += ["## Notes", "", *(f"- {_plain(note)}" for note in record.notes), ""]
     if record.choice:
         how = "by cross-validation" if by_folds else "on validation runs"
         lines += [f"Chosen {how}: {', '.join(f'{k} {v}' for k, v in record.choice.items())}.", ""]
@@ -153,11 +153,16 @@ def _level_row(surrogate: Surrogate, name: str, number: int) -> tuple[str, ...]:
 def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
     head = list(head)
     return [
-        "| " + " | ".join(head) + " |",
+        "| " + " | ".join(map(_plain, head)) + " |",
         "|" + "---|" * len(head),
-        *("| " + " | ".join(row) + " |" for row in rows),
+        *("| " + " | ".join(map(_plain, row)) + " |" for row in rows),
     ]
 
 
 def _runs(names: tuple[str, ...]) -> str:
-    return ", ".join(names) if names else "none"
+    return ", ".join(map(_plain, names)) if names else "none"
+
+
+def _plain(text: str) -> str:
+    """`text` on one line, with nothing that Markdown would take for a table, code or HTML: names come from strangers."""
+    return " ".join(str(text).split()).replace("|", "\\|").replace("`", "\\`").replace("<", "&lt;")

@@ -116,3 +116,13 @@ def test_lifting_keeps_the_precision_of_the_data() -> None:
 def test_no_public_name_is_hidden_by_a_module(name: str) -> None:
     getattr(mesh, name)  # imports the module behind it
     assert callable(getattr(mesh, name))
+
+
+def test_a_mesh_far_from_the_origin_is_coarsened_as_well() -> None:
+    position, faces, displacement = kart()
+    errors = []
+    for offset in (0.0, 1e6):
+        meter = LiftingMeter(build_hierarchy(position + offset, faces, [300, 75]))
+        meter.add(displacement[:1].reshape(-1, *displacement.shape[-2:]))
+        errors.append([error.mean for error in meter.errors])
+    np.testing.assert_allclose(errors[1], errors[0], rtol=0.2)

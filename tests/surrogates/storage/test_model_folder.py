@@ -128,3 +128,20 @@ def test_a_save_that_fails_leaves_nothing_behind(
     with pytest.raises(ModelFolderError, match="No space left on device"):
         save(surrogate, tmp_path / "model")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_names_of_strangers_break_no_table_of_the_card(surrogate: Surrogate) -> None:
+    from dataclasses import replace
+
+    from surrogates.storage.card import card
+
+    record = surrogate.record
+    before = record.fitted_runs, record.ranges
+    try:
+        record.fitted_runs = ("a|b", "<img src=x>", "line\nbreak")
+        record.ranges = replace(record.ranges, names=("x|y", *record.ranges.names[1:]))
+        text = card(surrogate)
+    finally:
+        record.fitted_runs, record.ranges = before
+    assert "a\\|b, &lt;img src=x>, line break" in text
+    assert "| x\\|y |" in text
