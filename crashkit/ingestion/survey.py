@@ -180,7 +180,7 @@ def survey(
                 with reading(source):
                     found = _look(run, name, source, index, choice, out)
                 if table is not None:
-                    row = table.rows[_row_of(table, name, used, out)]
+                    row = table.rows[_row_of(table, name, used)]
                     written = {**found.as_written, **{n: unit for n, (_, unit) in row.items()}}
                     found = replace(found, parameters=_from_table(found, row, out, table.path), as_written=written)
                 out.found.append(_same_parameters(found, out))
@@ -189,6 +189,10 @@ def survey(
             finally:
                 run.close()
     if table is not None:
+        by_number = [f"run {run} has row {key}" for key, run in used.items() if key != run]
+        if by_number:
+            more = f" and {len(by_number) - 3} more" if len(by_number) > 3 else ""
+            out.note(f"{table.path}: knows runs by their numbers, so {', '.join(by_number[:3])}{more}")
         unused = [r for r in table.rows if r not in used and r not in out.skipped]
         if unused:
             out.note(f"{table.path}: {_listed(unused)} in the table, but no such run was given")
@@ -216,15 +220,13 @@ def _leave_out_dead(out: Survey, choice: Choice) -> None:
     out.structure = replace(reduced, position=reduced.position * length)
 
 
-def _row_of(table: ParameterTable, run: str, used: dict[str, str], out: Survey) -> str:
+def _row_of(table: ParameterTable, run: str, used: dict[str, str]) -> str:
     """The row of `run`; one that another run has taken by its number belongs to neither."""
     key = table.key(run)
     if used.setdefault(key, run) != run:
         raise DataError(
             f"{table.path}: row {key} could be that of run {used[key]} and of run {run}; name the rows as the runs"
         )
-    if key != run:
-        out.note(f"{table.path}: knows runs by their numbers, so run {run} has row {key}")
     return key
 
 
@@ -473,7 +475,7 @@ def _from_table(
         if not unit:
             out.note(f"{path}: {name} has no unit and is taken for a plain number; name it as {name} [unit]")
         if value < 0 and "speed" in name.lower():
-            out.note(f"{path}: {name} is negative in the row of run {found.name}; is that meant?")
+            out.note(f"{path}: {name} is negative in some rows; is that meant?")
     return {**found.parameters, **values}
 
 

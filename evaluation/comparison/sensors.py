@@ -99,6 +99,9 @@ def choose_sensors(
     direction = np.zeros(3)
     direction[axis] = -np.sign(mean[axis]) or -1.0
     along = f"{'-' if direction[axis] < 0 else '+'}{'xyz'[axis]}"
+    if _on_a_line(reference.position):  # beams in a row: their rotation about the line cannot be seen
+        about = f"any node along {along}, against the motion, as seen from the ground, since all nodes lie on one line"
+        return Sensors(chosen, everything, direction, None, about)
     about = f"any node along {along}, against the motion, as seen from the rigid motion of the whole structure"
     return Sensors(chosen, everything, direction, everything, about)
 
@@ -123,6 +126,11 @@ def joined(pieces: Sequence[Piece]) -> Piece:
     """Pieces of a run, one behind the other."""
     kind = type(pieces[0])
     return kind(*(np.concatenate([getattr(piece, f.name) for piece in pieces]) for f in fields(kind)))
+
+
+def _on_a_line(position: NDArray[np.float64]) -> bool:
+    """Whether nodes (node, 3), m, are too few or too much in line to show a rotation."""
+    return len(position) < 3 or int(np.linalg.matrix_rank(position - position.mean(axis=0), tol=1e-9)) < 2
 
 
 def _spread(position: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -432,3 +432,23 @@ def test_source_files_are_recorded_with_their_checksums(tmp_path: Path) -> None:
         for run in ("run_000", "run_001")
     ]  # fmt: skip
     assert assembly.__version__ in open_dataset(tmp_path / "out.nc").attrs["history"]
+
+
+@pytest.mark.usefixtures("quick_disk")
+def test_full_disk_under_a_netcdf_file_is_one_line_and_keeps_the_runs(
+    tmp_path: Path, memory: RunsInMemory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """HDF5 says "HDF error" where the system says that the disk is full."""
+    source = memory.put(tmp_path / "runs", MemoryRun("a"), MemoryRun("b", speed=3.0))
+
+    def full(*_: object, **__: object) -> None:
+        raise RuntimeError("NetCDF: HDF error")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("crashkit.ingestion.store._create", full)
+        with pytest.raises(
+            OutputError, match=r"HDF error\); is the disk full\? \d+ MB are free in .*2 finished runs are kept"
+        ):
+            ingest(source, tmp_path / "o.nc", reader="memory")
+    assert not (tmp_path / "o.nc").exists()
+    assert ingest(source, tmp_path / "o.nc", reader="memory").resumed == 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from evaluation.comparison.scoring import (
     mesh_of,
     score_run,
 )
-from evaluation.comparison.sensors import Parted, Watched, choose_sensors
+from evaluation.comparison.sensors import Parted, Watched, choose_sensors, watch
 from evaluation.comparison.split import Split
 from evaluation.errors import EvaluationError
 from evaluation.measures.distance import Peak
@@ -412,3 +413,15 @@ def test_what_a_level_adds_is_its_field_less_the_coarser_one():
     assert list(parts) == ["MH3", "MH2", "MH1"]
     np.testing.assert_array_equal(parts["MH2"], lifted["MH2"] - lifted["MH3"])
     np.testing.assert_array_equal(parts["MH1"], lifted["MH1"] - lifted["MH2"])
+
+
+def test_nodes_on_one_line_are_watched_from_the_ground():
+    """Beams in a row show no rotation about their line, so nothing can be seen from their own rigid motion."""
+    line = np.column_stack([np.linspace(0, 1, 11), np.zeros(11), np.zeros(11)])
+    moved = np.zeros((2, 11, 3), np.float32)
+    moved[1, :, 2] = np.linspace(0, -0.1, 11)
+    structure = SimpleNamespace(position=line, n_nodes=11, displacement=lambda run: moved, position_of=lambda run: line)
+    sensors = choose_sensors(structure)
+    assert sensors.watching is None
+    assert "from the ground, since all nodes lie on one line" in sensors.about
+    np.testing.assert_allclose(watch(structure, sensors, 0, moved).intrusion, [0.0, 0.0], atol=1e-9)
