@@ -108,3 +108,50 @@ def test_a_damaged_file_is_named(tmp_path, only_run, sample):
     (tmp_path / "kart_1.ply").write_bytes((tmp_path / "kart_1.ply").read_bytes()[:500])
     with pytest.raises(ReadError, match=r"kart_1\.ply"):
         only_run(tmp_path, "meshio", time_step=1)
+
+
+def test_states_without_times_are_read_with_a_time_step(tmp_path, only_run):
+    grids = "".join(GRID.format(time=k, z=k).replace(f'<Time Value="{k}"/>', "") for k in range(3))
+    (tmp_path / "run.xdmf").write_text(XDMF.format(grids=grids))
+    assert only_run(tmp_path, time_step=0.5).time.tolist() == [0.0, 0.5, 1.0]
+    with pytest.raises(ReadError, match=r"its 3 states have no time; give the time between two \(--time-step\)"):
+        only_run(tmp_path)
+
+
+def test_a_checkpoint_of_fenics_is_called_by_its_name(tmp_path, only_run):
+    function = '<Attribute ItemType="FiniteElementFunction" ElementFamily="CG" ElementDegree="1" Name="u"/></Grid>'
+    grids = "".join(GRID.format(time=k, z=k).replace("</Grid>", function) for k in range(2))
+    (tmp_path / "u.xdmf").write_text(XDMF.format(grids=grids))
+    with pytest.raises(ReadError, match="is a checkpoint of FEniCS") as caught:
+        only_run(tmp_path)
+    assert "damaged" not in str(caught.value)
+
+
+def test_functions_in_time_series_of_their_own_are_taken_together(tmp_path, only_run, sample):
+    """dolfinx writes the mesh once, and one time series for every function."""
+
+    def rows(values: np.ndarray) -> str:
+        return " ".join(f"{v:.9g}" for v in np.ravel(values))
+
+    def item(values: np.ndarray, kind: str = "Float") -> str:
+        shape = " ".join(map(str, values.shape))
+        return f'<DataItem DataType="{kind}" Dimensions="{shape}" Format="XML">{rows(values)}</DataItem>'
+
+    def series(name: str, kind: str, arrays: list[np.ndarray]) -> str:
+        states = "".join(
+            f'<Grid GridType="Uniform"><Time Value="{t}"/><Attribute Name="{name}" AttributeType="{kind}" Center="Node">'
+            f"{item(values)}</Attribute></Grid>"
+            for t, values in zip(sample.time, arrays, strict=True)
+        )
+        return f'<Grid GridType="Collection" CollectionType="Temporal">{states}</Grid>'
+
+    mesh = (
+        f'<Grid GridType="Uniform"><Topology TopologyType="Triangle">{item(sample.faces, "Int")}</Topology>'
+        f'<Geometry GeometryType="XYZ">{item(sample.points)}</Geometry></Grid>'
+    )
+    heat = [np.full(162, float(k)) for k in range(3)]
+    both = series("displacement", "Vector", list(sample.displacement)) + series("heat", "Scalar", heat)
+    (tmp_path / "run.xdmf").write_text(f'<Xdmf Version="3.0"><Domain>{mesh}{both}</Domain></Xdmf>')
+    run = only_run(tmp_path)
+    np.testing.assert_allclose(run.displacement(0, 3), sample.displacement, atol=1e-8)
+    assert run.field("heat", 2, 3)[0, 0] == 2
