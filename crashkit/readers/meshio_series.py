@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,6 +158,8 @@ class _Xdmf(WholeStates):
         if own and step is not None:
             self.notes = (f"{file}: holds times of its own, so --time-step is not used",)
         self.time = np.array(own or [k * (step or 0.0) for k in range(count)], np.float64)
+        for grid, time in zip(self._reader.collection, self.time, strict=True) if not own else ():
+            ElementTree.SubElement(grid, "Time", Value=str(time))  # meshio reads no state without one
         self._take_in_others()
         self._mesh = self._reader.mesh_grid
         self.files = (file, *sorted(self._data_files()))
