@@ -110,7 +110,7 @@ class Replay:
                 return out
             chosen += self.ask(surrogate, chosen, pool)
 
-    def train_surrogate(self, runs: list[int]) -> Surrogate:
+    def train(self, runs: list[int]) -> Surrogate:
         some = replace(
             self.whole, parameters=self.whole.parameters[runs], runs=tuple(self.whole.runs[k] for k in runs),
             displacement=lambda level: self.memory[runs],

@@ -59,3 +59,23 @@ class Level:
     def adjacency(self) -> sparse.csr_matrix:
         """Symmetric 0/1 adjacency (n, n) of `edges`, without loops."""
         return adjacency(self.n_nodes, self.edges)
+
+
+def lift(to_full: sparse.csr_matrix, states: NDArray[np.floating]) -> NDArray[np.floating]:
+    """`states` (state, node of a level, 3) on level 0: (state, node, 3), in their precision.
+
+    The static upsampling of the paper (section 3.2), the same for every model, so that levels can be compared. The result
+    is a view whose memory lies node by node: one sparse product serves all states, and transposing costs more than that.
+
+    Raises
+    ------
+    ValueError
+        If the map is one from another number of nodes.
+    """
+    count, nodes, _ = states.shape
+    if to_full.shape[1] != nodes:
+        raise ValueError(
+            f"the upsampling takes {to_full.shape[1]} nodes and the field has {nodes}; expected those of its level"
+        )
+    rows = to_full.astype(states.dtype, copy=False) @ states.transpose(1, 2, 0).reshape(nodes, -1)
+    return rows.reshape(-1, 3, count).transpose(2, 0, 1)

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 from torch import Tensor
 
+from data_schema.levels import lift
 from surrogates.data.campaign import Labels
 from surrogates.data.graphs import Graphs
 from surrogates.errors import SurrogateError
@@ -99,11 +100,9 @@ class Surrogate:
 
     def _lifted(self, states: Tensor, level: int) -> Tensor:
         """(node of `level`, b, 3) -> (b, node of the full mesh, 3), a view: transposing it costs more than lifting."""
-        by_channel = states.transpose(1, 2)  # predictions lie in memory this way
         if level not in self._upward:
             self._upward[level] = self.graphs.to_full(level).astype(np.float32)
-        rows = self._upward[level] @ by_channel.flatten(1).numpy()
-        return torch.from_numpy(rows).view(-1, *by_channel.shape[1:]).permute(2, 0, 1)
+        return torch.from_numpy(lift(self._upward[level], states.transpose(0, 1).numpy()))
 
     def reconstruct(self, states: ArrayLike, level: int | None = None) -> NDArray[np.float32]:
         """Encode and decode displacements (state, node of `level`, 3), m: what the reduction alone costs."""

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
 
 from crashkit.errors import DataError
 
@@ -158,11 +159,10 @@ def _hermite(values: NDArray, own: NDArray[np.float64], n: int, f: float) -> NDA
     if len(own) < 3:
         return straight
     slope_a, slope_b = _slope(values, own, n), _slope(values, own, n + 1)
-    s = 1 - f
-    curve = (
-        (1 + 2 * f) * s * s * a + f * s * s * h * slope_a + f * f * (3 - 2 * f) * b - f * f * s * h * slope_b
-    ).astype(values.dtype)
-    return np.where(np.isfinite(curve), curve, straight)
+    ends, slopes = np.stack([a, b]), np.stack([slope_a, slope_b])
+    known = np.isfinite(ends).all(axis=0) & np.isfinite(slopes).all(axis=0)
+    spline = CubicHermiteSpline([0.0, h], np.where(known, ends, 0.0), np.where(known, slopes, 0.0))
+    return np.where(known, spline(f * h).astype(values.dtype), straight)
 
 
 def _slope(values: NDArray, own: NDArray[np.float64], n: int) -> NDArray:

@@ -15,7 +15,6 @@ _LAZY = {
     "Surface": "surface",
     "build_hierarchy": "hierarchy",
     "level_displacement": "store",
-    "lift": "lifting",
     "read_hierarchy": "store",
     "summarize_hierarchy": "store",
     "write_hierarchy": "store",

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from crashkit.mesh.levels import Hierarchy
 from crashkit.readers.base import split_states
-from data_schema.levels import Level
+from data_schema.levels import lift
 
 # Bytes of displacement lifted at once.
 _BUDGET = 32 << 20
@@ -37,7 +37,7 @@ class LiftingMeter:
         for begin, end in split_states(len(displacement), displacement.shape[1], _BUDGET):
             block = displacement[begin:end]
             for k, level in enumerate(self._levels):
-                error = np.linalg.norm(lift(level, block[:, level.kept]) - block, axis=-1)
+                error = np.linalg.norm(lift(level.to_full, block[:, level.kept]) - block, axis=-1)
                 there = np.isfinite(error)
                 self._sum[k] += error[there].sum(dtype=np.float64)
                 self._count[k] += there.sum()
@@ -51,11 +51,3 @@ class LiftingMeter:
             LiftingError(float(s / c), float(m) if c == c else float("nan"))
             for s, c, m in zip(self._sum, counts, self._largest, strict=True)
         ]
-
-
-def lift(level: Level, displacement: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Displacements (state, node of `level`, 3) on level 0, (state, node, 3), by the level's static map U."""
-    states, nodes, _ = displacement.shape
-    flat = displacement.transpose(1, 0, 2).reshape(nodes, states * 3)
-    u = level.to_full.astype(displacement.dtype)
-    return (u @ flat).reshape(-1, states, 3).transpose(1, 0, 2)

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from data_schema.levels import Level
+from data_schema.levels import Level, lift
 from evaluation.comparison.predictor import NOMINAL, Banded, Predictor
 from evaluation.comparison.reference import Reference
 from evaluation.comparison.sensors import Parted, Sensors, Watched, joined, part_error, watch
 from evaluation.errors import EvaluationError
-from evaluation.measures.distance import Peak, lift, masked_mean, mean_node_error, node_distance
+from evaluation.measures.distance import Peak, masked_mean, mean_node_error, node_distance
 from evaluation.measures.projection import last_seen, projection_error
 from evaluation.measures.tally import Groups, Tally, state_blocks
 
@@ -241,7 +241,7 @@ def _lifting(reference: Reference, truth: NDArray[np.float32]) -> dict[int, NDAr
         kept = last_seen(truth[:, level.kept])
         blocks = state_blocks(*truth.shape[:2])
         out[level.index] = np.concatenate(
-            [mean_node_error(node_distance(truth[s], lift(kept[s], level.to_full))) for s in blocks]
+            [mean_node_error(node_distance(truth[s], lift(level.to_full, kept[s]))) for s in blocks]
         )
     return out
 
@@ -266,7 +266,8 @@ def full_field(
             f"gave an array of shape {field.shape}; expected {expected} on level {predictor.level} of this dataset; "
             f"evaluate it with the dataset it was trained on"
         )
-    return np.asarray(field, dtype=np.float32) if mesh is None else lift(field, mesh.to_full)
+    own = np.asarray(field, dtype=np.float32)
+    return own if mesh is None else np.ascontiguousarray(lift(mesh.to_full, own))
 
 
 def mesh_of(reference: Reference, predictor: Predictor) -> Level | None:

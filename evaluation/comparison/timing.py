@@ -6,10 +6,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from data_schema.levels import lift
 from evaluation.comparison.predictor import Predictor
 from evaluation.comparison.reference import Reference
 from evaluation.comparison.scoring import mesh_of
-from evaluation.measures.distance import lift
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def time_predictions(reference: Reference, predictor: Predictor, run: int, repea
         def call() -> None:
             field = predictor.predict(parameters, times[-states:])
             if lifted and to_full is not None:
-                lift(field, to_full)
+                lift(to_full, field)
 
         return call
 

@@ -129,20 +129,3 @@ def group_error(distance: NDArray[np.float64], groups: Sequence[NDArray[np.integ
     Every state counts the same, as in e2; a group that is empty or gone throughout gives NaN.
     """
     return masked_mean(group_means(distance, groups), axis=0)
-
-
-def lift(field: NDArray[np.floating], to_full: object) -> NDArray[np.float32]:
-    """`field` (state, coarse node, 3) through the sparse map `to_full` (node, coarse node): (state, node, 3).
-
-    The static upsampling of the paper (section 3.2), the same for every model, so that levels can be compared.
-    """
-    states, nodes, _ = field.shape
-    if to_full.shape[1] != nodes:  # type: ignore[attr-defined]
-        raise EvaluationError(
-            f"the upsampling takes {to_full.shape[1]} nodes and the field has {nodes}; "  # type: ignore[attr-defined]
-            f"expected the nodes of the level it belongs to"
-        )
-    # One sparse product for all states: nodes first, states and directions side by side.
-    columns = np.ascontiguousarray(field.transpose(1, 0, 2), dtype=np.float32).reshape(nodes, -1)
-    lifted = to_full.astype(np.float32) @ columns  # type: ignore[attr-defined]
-    return np.ascontiguousarray(lifted.reshape(-1, states, 3).transpose(1, 0, 2))

@@ -8,8 +8,9 @@ from mesh_shapes import joined, kart, plate
 
 from crashkit import mesh
 from crashkit.errors import MeshError
-from crashkit.mesh import build_hierarchy, lift
+from crashkit.mesh import build_hierarchy
 from crashkit.mesh.lifting import LiftingMeter
+from data_schema.levels import lift
 
 
 def test_without_counts_an_eighth_and_two_quarters_are_kept() -> None:
@@ -109,7 +110,7 @@ def test_the_quadric_selection_lifts_better_than_the_one_through_vtk() -> None:
 def test_lifting_keeps_the_precision_of_the_data() -> None:
     position, faces = plate(6, 6)
     level = build_hierarchy(position, faces, [12])[1]
-    assert lift(level, np.ones((2, 12, 3), np.float32)).dtype == np.float32
+    assert lift(level.to_full, np.ones((2, 12, 3), np.float32)).dtype == np.float32
 
 
 @pytest.mark.parametrize("name", mesh.__all__)

@@ -8,8 +8,8 @@ from scipy import sparse
 
 from crashkit.mesh import lifting
 from crashkit.mesh.levels import Hierarchy
-from crashkit.mesh.lifting import LiftingMeter, lift
-from data_schema.levels import Level
+from crashkit.mesh.lifting import LiftingMeter
+from data_schema.levels import Level, lift
 
 
 def level(index: int, kept: list[int], to_full: list[list[float]]) -> Level:
@@ -35,7 +35,7 @@ def moved(states: int = 1) -> np.ndarray:
 
 def test_lifting_weights_the_kept_nodes_in_every_direction_and_state() -> None:
     coarse = np.array([[[0, 0, 0], [4, 8, -4]], [[1, 1, 1], [1, 1, 1]]], np.float32)
-    found = lift(FINE, coarse)
+    found = lift(FINE.to_full, coarse)
     assert found.shape == (2, 5, 3)
     np.testing.assert_array_equal(found[0], np.arange(5)[:, None] * np.array([1, 2, -1]))
     np.testing.assert_array_equal(found[1], np.ones((5, 3)))
@@ -85,7 +85,7 @@ def test_how_many_states_are_lifted_at_once_changes_nothing(
     whole.add(moved(5))
     lifted: list[int] = []
     original = lift
-    monkeypatch.setattr(lifting, "lift", lambda level, u: lifted.append(len(u)) or original(level, u))
+    monkeypatch.setattr(lifting, "lift", lambda to_full, u: lifted.append(len(u)) or original(to_full, u))
     monkeypatch.setattr(lifting, "_BUDGET", states_at_once * 5 * 12)
     pieces.add(moved(5))
     assert max(lifted) == states_at_once

@@ -7,13 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from scipy import sparse
 
 from evaluation.errors import EvaluationError
 from evaluation.measures.distance import (
     group_error,
     largest_node_error,
-    lift,
     masked_mean,
     mean_displacement,
     mean_node_error,
@@ -123,16 +121,3 @@ def test_masked_mean_warns_of_nothing_and_knows_axes():
     values = np.array([[1.0, np.nan], [np.nan, np.nan]])
     np.testing.assert_array_equal(masked_mean(values, axis=1), [1.0, np.nan])
     assert masked_mean(values) == 1.0
-
-
-def test_lifting_is_a_product_with_the_map_in_every_direction():
-    rng = np.random.default_rng(2)
-    to_full = sparse.random(9, 4, density=0.6, random_state=0, format="csr")
-    field = rng.normal(size=(3, 4, 3)).astype(np.float32)
-    expected = np.einsum("nk,skd->snd", to_full.toarray(), field)
-    np.testing.assert_allclose(lift(field, to_full), expected, rtol=1e-5, atol=1e-6)
-
-
-def test_lifting_from_another_mesh_is_an_error():
-    with pytest.raises(EvaluationError, match="takes 4 nodes and the field has 5"):
-        lift(np.zeros((1, 5, 3), np.float32), sparse.csr_matrix((9, 4)))
