@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+_log = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -123,6 +126,7 @@ def _mirrors(dataset: Any) -> tuple[Mirror, ...]:
     if "sim" in at.dims and float((at.max("sim") - at.min("sim")).max()) > 1e-9:
         return ()
     at = at.isel(sim=0) if "sim" in at.dims else at
+    _log.info("mirror planes of the mesh")
     part = dataset["face_part"].values if "face_part" in dataset else None
     try:
         planes = mirror_planes(at.values, dataset["face_nodes"].values, part)

@@ -387,6 +387,8 @@ def as_model(surrogate: Surrogate, folder: Path, reference: Reference) -> Model:
         checksum=record.checksum,
         seed=record.seed,
         configuration=configuration,
+        known={name: told for name, told in record.physics.items() if isinstance(told, str)},
+        worth=record.physics.get("errors") or {},
     )
 
 

@@ -86,6 +86,10 @@ class Model:
         Of its training; None where nothing is random.
     configuration
         Its settings, for the methods section; without the seed, models of one kind agree in it.
+    known
+        What was put in before the first run, a sentence by its name: inputs, clock, symmetry.
+    worth
+        Error in cross-validation, m, with and without each of these.
     """
 
     name: str
@@ -96,6 +100,8 @@ class Model:
     checksum: str = ""
     seed: int | None = None
     configuration: Mapping[str, object] = field(default_factory=dict)
+    known: Mapping[str, str] = field(default_factory=dict)
+    worth: Mapping[str, float] = field(default_factory=dict)
 
 
 def array_names(models: Sequence[Model]) -> dict[tuple[str, str], str]:

@@ -58,7 +58,7 @@ _TEXT = (
     "floor) is the error of projecting the test runs on the leading modes of all other runs, not centred. The "
     "interpolation error is the error of interpolating the true states back from the nodes of a coarse mesh.",
     "A band is an interval around the prediction that should contain 90 % of nodes and states; its width comes from "
-    "the errors on validation runs. The table lists the share of the test runs' nodes and states within it.",
+    "the errors on runs the model had not seen. The table lists the share of the test runs' nodes and states within it.",
     "Milliseconds are the fastest of nine repetitions on the machine named below, for all states of a run asked "
     "in one call "
     "and divided by their number, unless a column says otherwise.",
@@ -105,6 +105,7 @@ def write_report(
         "worst": tables.worst_places(evaluation),
         **_ratings(evaluation),
         "split": tables.split(evaluation),
+        **_worth(evaluation),
     }
     (folder / "tables").mkdir(exist_ok=True)
     for name, columns in all_tables.items():
@@ -119,7 +120,7 @@ def write_report(
         figures=shown,
         views=views,
         text=_TEXT,
-        methods=[*evaluation.context.items(), *([("Left out", left_out)] if left_out else [])],
+        methods=[*evaluation.context.items(), *_known(evaluation), *([("Left out", left_out)] if left_out else [])],
         details=_details(evaluation),
         tables=[*_tables(performance, all_tables), *_file_table(evaluation, folder)],
     )
@@ -144,6 +145,28 @@ def _ratings(evaluation: Evaluation) -> dict[str, Columns]:
         return {}
     nodes = [int(n) for n in evaluation.reference.node_id[evaluation.sensors.probes]]
     return {"ratings": rating_table(evaluation.ratings, nodes)}
+
+
+def _known(evaluation: Evaluation) -> list[tuple[str, str]]:
+    """What each model was given before the first run, once where several were given the same."""
+    alike: dict[tuple[tuple[str, str], ...], list[str]] = {}
+    for model in evaluation.models:
+        if model.known:
+            alike.setdefault(tuple(model.known.items()), []).append(model.name)
+    return [
+        (f"Known beforehand by {', '.join(models)}: {name}", text)
+        for told, models in alike.items()
+        for name, text in told
+    ]
+
+
+def _worth(evaluation: Evaluation) -> dict[str, Columns]:
+    """The table of what each idea is worth in cross-validation under its name; empty where no model had any."""
+    rows = [(m.name, name, error * CM) for m in evaluation.models for name, error in m.worth.items()]
+    if not rows:
+        return {}
+    models, names, errors = (list(column) for column in zip(*rows, strict=True))
+    return {"worth": {"model": models, "with": names, "error_cm": errors}}
 
 
 def _views(evaluation: Evaluation) -> tuple[list[ShownView], str]:
@@ -201,6 +224,17 @@ def _tables(performance: Columns, all_tables: Mapping[str, Columns]) -> list[Sho
                 )
             ]
             if "ratings" in all_tables
+            else []
+        ),
+        *(
+            [
+                show_table(
+                    "Known before the first run: what each idea is worth",
+                    all_tables["worth"],
+                    "Mean node error, cm, of a process over whole runs in cross-validation over the training runs.",
+                )
+            ]
+            if "worth" in all_tables
             else []
         ),
         show_table("Every test run", all_tables["runs"], "Mean node error over nodes and time, cm."),

@@ -8,6 +8,7 @@ everything is fitted again to all of them.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -26,6 +27,8 @@ from surrogates.physics.registration import Registration
 from surrogates.physics.trials import Courses, Folds, Machine, Trials, courses_of
 from surrogates.regression.gaussian import Gaussian, RadialBasis
 from surrogates.settings import Settings
+
+_log = logging.getLogger(__name__)
 
 Inputs = Literal["trajectory", "point"]
 # Share of the time steps' length below which two times are the same.
@@ -178,16 +181,16 @@ def fit_pod_regression(
     settings: Settings,
     chosen: NDArray[np.int64],
     notes: Notes,
-    report: Callable[[str], None] = lambda line: None,
 ) -> PodFit:
     """Choose registration, view and modes by folds of the runs `chosen`, then fit to all of them."""
     if not settings.pod.modes:
         raise SurrogateError("pod.modes is empty; give at least one number of modes")
+    _log.info("modes of %d runs", len(chosen))
     courses = courses_of(campaign, settings, chosen, notes)
     scale_of(float(np.square(courses.own, dtype=np.float64).sum()))
     folds = _folds(campaign, settings, chosen)
     trials = Trials(courses, campaign.parameters[chosen], folds, settings.model, settings.seed)
-    registration, plane, worth = choose(campaign, chosen, settings, trials, report)
+    registration, plane, worth = choose(campaign, chosen, settings, trials)
     candidates = [_Candidate("trajectory", registration, plane)]
     if settings.pod.inputs == "point":
         candidates = [_Candidate("point", Registration.identity(campaign.parameter_names, courses.time), 0)]
@@ -200,7 +203,7 @@ def fit_pod_regression(
             f"{len(chosen)} runs cannot be told apart by folds; {count} modes and {best.view} inputs are taken unseen"
         )
     else:
-        report("number of modes")
+        _log.info("number of modes by cross-validation")
         errors = {c: _errors(c, trials, settings, counts) for c in candidates}
         best, count = _best(errors, counts)
     choice = PodChoice(best.view, count, _named(errors, counts))

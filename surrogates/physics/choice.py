@@ -7,7 +7,8 @@ Inputs of one clock are first compared by likelihood, and only the best of them 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import logging
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -34,6 +35,8 @@ from surrogates.physics.registration import Registration
 from surrogates.physics.symmetry import Symmetry, may_be_odd
 from surrogates.physics.trials import Trials
 from surrogates.settings import Settings
+
+_log = logging.getLogger(__name__)
 
 # A change is kept if it lowers the error by this share; the whole is if it does by the larger one.
 _WORTH_A_CHANGE = 0.003
@@ -84,6 +87,7 @@ class _Search:
         self.others = tuple(k for k in positive if self.dimensions[k] in (STRESS, MASS))
         self.plain = DerivedInputs.identity(self.names)
         self.tried: set[_Way] = set()
+        self.lowest = np.inf
 
     def registration(self, way: _Way) -> Registration:
         clock = Clock.identity(len(self.names))
@@ -96,8 +100,13 @@ class _Search:
         return Registration(way.inputs, clock, symmetry, grid, reach)
 
     def error(self, way: _Way) -> float:
+        if way not in self.tried:
+            best = f", best {100 * self.lowest:.2f} cm" if np.isfinite(self.lowest) else ""
+            _log.info("physics: %d tried by cross-validation%s", len(self.tried), best)
         self.tried.add(way)
-        return float(np.nanmean(self.trials.errors(self.registration(way), way.plane or 0)))
+        error = float(np.nanmean(self.trials.errors(self.registration(way), way.plane or 0)))
+        self.lowest = min(self.lowest, error)
+        return error
 
     def best(self, ways: Sequence[_Way], margin: float = _WORTH_A_CHANGE) -> _Way:
         """The first one unless another is better by `margin`."""
@@ -201,7 +210,6 @@ def choose(
     chosen: NDArray[np.int64],
     settings: Settings,
     trials: Trials,
-    tell: Callable[[str], None] = lambda line: None,
 ) -> tuple[Registration, int, Worth]:
     """The registration of the training runs `chosen`, the place of its plane, and what it is worth.
 
@@ -216,7 +224,6 @@ def choose(
     way = search.best([identity, *search.starts()], margin=0.0)
     if way == identity:
         way = search.best(search.starts(), margin=0.0)
-    tell("inputs, clock and symmetry: all at once")
     for _ in range(_ROUNDS):
         before = way
         way = search.improved_inputs(way)

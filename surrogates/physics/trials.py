@@ -7,6 +7,7 @@ some nodes and states of the left-out runs as computed; a run and its image alwa
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -22,6 +23,8 @@ from surrogates.physics.registration import Registration
 from surrogates.physics.symmetry import mirrored
 from surrogates.regression.gaussian import Gaussian, Kernel, RadialBasis
 from surrogates.settings import Settings
+
+_log = logging.getLogger(__name__)
 
 # Modes of the common basis, and numbers a field of that many modes may hold at most.
 MODES = 128
@@ -119,6 +122,7 @@ class Courses:
         states = np.unique(np.linspace(0, runs.states - 1, _JUDGED_STATES).astype(int))
         truth = np.empty((len(chosen), len(states), len(nodes), 3), np.float32)
         for k, run in enumerate(chosen):
+            _log.info("coefficients of run %d of %d", k + 1, len(chosen))
             values = runs.read(run)
             own[k] = values.reshape(len(values), -1) @ basis
             truth[k] = values[states][:, nodes]
@@ -299,7 +303,8 @@ def _without_translations(
 
     def states() -> Iterator[NDArray[np.float32]]:
         held: list[NDArray[np.float32]] = []
-        for run in chosen:
+        for k, run in enumerate(chosen):
+            _log.info("modes of run %d of %d%s", k + 1, len(chosen), " and its images" if mirrors else "")
             values = runs.read(run)
             values = values[np.unique(np.linspace(0, len(values) - 1, _BASIS_STATES).astype(int))]
             for part in (values, *(mirrored(mirror, values) for mirror in mirrors)):

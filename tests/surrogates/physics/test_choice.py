@@ -1,0 +1,109 @@
+"""The registration is chosen by folds, and left alone where it does not pay."""
+
+from __future__ import annotations
+
+import numpy as np
+import plate
+import pytest
+
+from surrogates.data.campaign import Campaign
+from surrogates.data.samples import Notes
+from surrogates.errors import SurrogateError
+from surrogates.physics.choice import choose
+from surrogates.physics.derived import SPEED, STRESS
+from surrogates.physics.trials import Folds, Trials, courses_of
+from surrogates.settings import Settings, settings
+
+TIME = np.linspace(0.0, 0.03, 16)
+
+
+def crash(runs: int, seed: int = 0) -> Campaign:
+    """A beam that bends as its damage number v^2 / sigma says, on a clock and of a size that go with v and sigma."""
+    draw = np.random.default_rng(seed)
+    mu = draw.uniform([5, -1, 2e8], [35, 1, 8e8], (runs, 3))
+    x = np.linspace(0, 1, 30)
+    rate = (mu[:, 0] / 20) ** 0.25 * (mu[:, 2] / 5e8) ** 0.25
+    tau = rate[:, None] * TIME / TIME[-1]
+    damage = np.log(mu[:, 0] ** 2 / mu[:, 2] * 5e8 / 400)
+    size = mu[:, 0] / rate / 20
+    shape = np.sin(np.pi * x * (2 + np.tanh(damage))[:, None])[:, None] * np.minimum(tau, 0.8)[..., None] ** 2
+    u = np.zeros((runs, len(TIME), 30, 3))
+    u[..., 0] = (size[:, None] * tau)[..., None]
+    u[..., 2] = size[:, None, None] * (0.3 * shape + 0.1 * mu[:, 1, None, None] * tau[..., None] * x)
+    u = u.astype(np.float32)
+    return Campaign(
+        mu, ("speed", "offset", "strength"), ("m s-1", "m", "Pa"), TIME, lambda level: u, 30,
+        dimensions=(SPEED, (0.0, 1.0, 0.0), STRESS),
+    )  # fmt: skip
+
+
+def found(of: Campaign, chosen: Settings):  # type: ignore[no-untyped-def]
+    runs = np.arange(len(of.parameters))
+    courses = courses_of(of, chosen, runs, Notes())
+    trials = Trials(courses, of.parameters, Folds.of(len(runs), 6, 0), "pod-gpr", 0)
+    return choose(of, runs, chosen, trials)
+
+
+def test_clock_and_damage_number_are_found_and_worth_it() -> None:
+    registration, _, worth = found(crash(24), settings("pod-gpr"))
+    assert not registration.clock.is_identity
+    assert registration.clock.speed == 0
+    assert registration.clock.exponents[0] == pytest.approx(0.25, abs=0.13)
+    assert worth.errors["all of it"] < 0.6 * worth.errors["parameters as they are"]
+    assert worth.errors["all of it"] <= min(worth.errors.values())
+    assert {"clock and size alone", "all but clock and size"} <= worth.errors.keys()
+
+
+@pytest.mark.parametrize("idea", ["inputs.derived=off", "physics.clock=off"])
+def test_what_is_switched_off_stays_off(idea: str) -> None:
+    registration, _, _ = found(crash(16), settings("pod-gpr", overrides=[idea]))
+    assert registration.clock.is_identity if "clock" in idea else registration.inputs.is_identity
+
+
+def test_named_monomials_are_the_ones_taken() -> None:
+    chosen = settings("pod-gpr", overrides=["inputs.derived=speed**2/strength"])
+    registration, _, _ = found(crash(16), chosen)
+    if not registration.inputs.is_identity:
+        assert "ln(speed^2 / strength)" in registration.inputs.told()
+
+
+def test_noise_is_left_as_it_is() -> None:
+    draw = np.random.default_rng(3)
+    noise = draw.standard_normal((16, 7, 81, 3)).astype(np.float32)
+    campaign = plate.campaign(16, displacement=lambda level: noise, dimensions=(SPEED, None, STRESS))
+    registration, _, worth = found(campaign, settings("pod-gpr"))
+    if registration.is_identity:
+        assert list(worth.errors) == ["parameters as they are"]
+    else:
+        assert worth.errors["all of it"] <= 0.99 * worth.errors["parameters as they are"]
+
+
+@pytest.mark.parametrize(
+    ("override", "told"),
+    [
+        ("physics.odd=[weight]", "physics.odd names 'weight', which is no parameter; there are speed"),
+        ("inputs.derived=speed**2/offset", "takes the logarithm of offset"),
+        ("inputs.derived=speed**2/weight", "no parameter"),
+    ],
+)
+def test_names_that_are_not_there_are_refused(override: str, told: str) -> None:
+    with pytest.raises(SurrogateError, match=told):
+        found(crash(8), settings("pod-gpr", overrides=[override]))
+
+
+def test_few_runs_choose_nothing() -> None:
+    registration, _, worth = found(crash(5), settings("pod-gpr"))
+    assert registration.is_identity
+    assert not worth.errors
+
+
+def test_every_run_is_left_out_as_often_as_any_other_and_never_trains_then() -> None:
+    for runs in (3, 12, 16, 40, 70):
+        folds = Folds.of(runs, 6, 0)
+        times = np.zeros(runs, int)
+        for train, held in folds:
+            assert not set(train) & set(held)
+            assert len(train) + len(held) == runs
+            times[held] += 1
+        assert len(set(times)) == 1
+        assert times[0] == {3: 1, 12: 1, 16: 3, 40: 2, 70: 1}[runs]
