@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from scipy import sparse
 from torch import Tensor
@@ -41,6 +40,7 @@ from surrogates.physics.registration import Registration
 from surrogates.record import Record, record_as_dict, record_from_dict
 from surrogates.settings import Settings, parse
 from surrogates.storage.card import card
+from surrogates.storage.checks import check_bands, check_core, check_graphs, check_labels, check_record, plain_files
 from surrogates.surrogate import Surrogate
 from surrogates.uncertainty import Band, Spread
 
@@ -83,7 +83,11 @@ def load(folder: str | Path) -> Surrogate:
     """
     folder = Path(folder)
     about = _about(folder)
-    for name, digest in about["files"].items():
+    try:
+        files = plain_files(about.get("files"))
+    except SurrogateError as error:
+        raise ModelFolderError(f"{folder / _MAIN}: {error}; copy the model folder again") from error
+    for name, digest in files.items():
         path = folder / name
         if not path.is_file():
             raise ModelFolderError(f"{path}: is missing; copy the whole model folder again")
@@ -95,15 +99,23 @@ def load(folder: str | Path) -> Surrogate:
         record = record_from_dict(about["record"], {int(k): v for k, v in histories.items()})
         stored = load_file(folder / "graphs.safetensors")
         graphs, points, faces = _graphs(stored)
+        check_record(record)
+        check_graphs(graphs, points, faces)
         core = _core(folder, about, settings, record, graphs)
         registration = Registration.from_dict(about["registration"])
         bands = _bands(load_file(folder / "bands.safetensors"), record)
         labels = _labels(stored, about)
+        check_bands(bands, graphs, record)
+        check_labels(labels, graphs.n_full, 0 if faces is None else len(faces))
+        check_core(core, graphs)
+        surrogate = Surrogate(settings, record, graphs, core, points, faces, registration)
+        for number in core.numbers:  # asked once: sizes that do not fit show here
+            surrogate.predict((record.ranges.low + record.ranges.high) / 2, record.time[:1], number)
     except ModelFolderError:
         raise
-    except (SurrogateError, SafetensorError, KeyError, TypeError, ValueError, IndexError) as error:
-        raise ModelFolderError(f"{folder}: does not hold together ({error}); train it again") from error
-    surrogate = Surrogate(settings, record, graphs, core, points, faces, registration)
+    except Exception as error:  # what a folder of somebody else makes the libraries raise is theirs to choose
+        said = " ".join(str(error).split())[:200] or type(error).__name__
+        raise ModelFolderError(f"{folder}: does not hold together ({said}); train it again") from error
     surrogate.bands = bands
     surrogate.labels = labels
     return surrogate
@@ -144,7 +156,7 @@ def _about(folder: Path) -> dict[str, Any]:
         raise ModelFolderError(f"{folder}: holds no {_MAIN}; expected a model folder made by crashkit train")
     try:
         about = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ModelFolderError(f"{path}: is no JSON ({error}); copy the model folder again") from error
     if not isinstance(about, dict) or "format" not in about:
         raise ModelFolderError(f"{path}: is no model description; expected a model folder made by crashkit train")
