@@ -63,7 +63,15 @@ def run(*arguments: object):
 def test_the_whole_way(campaign, small, tmp_path):
     out = tmp_path / "report"
     result = run(
-        campaign / "kart.zarr", campaign / "mh0", campaign / "podnn", "-o", out, "--write-vtu", "--vtk-runs", "6"
+        campaign / "kart.zarr",
+        campaign / "mh0",
+        campaign / "podnn",
+        "-o",
+        out,
+        "--write-vtu",
+        "--write-vtkhdf",
+        "--vtk-runs",
+        "6",
     )
     assert result.exit_code == 0, result.output
     assert "MH1" in result.stdout
