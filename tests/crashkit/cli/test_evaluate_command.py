@@ -80,7 +80,7 @@ def test_the_whole_way(campaign, small, tmp_path):
     assert [r["model"] for r in numbers["performance"]] == ["MH1", "MH2", "PODNN"]
     names = [str(n) for n in open_dataset(campaign / "kart.zarr")["sim"].values]
     assert numbers["test_runs"] == names[5:]
-    assert (out / "vtk" / f"{names[6]}_mh0.vtkhdf").exists()
+    assert (out / "vtk" / f"{names[6]}.vtkhdf").exists()
     assert (out / "vtk" / f"{names[6]}_mh0_level2.pvd").exists()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["report"]
     assert "kart.zarr" in (out / "report.html").read_text(encoding="utf-8")
