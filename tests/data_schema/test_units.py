@@ -114,3 +114,29 @@ def test_words_are_no_units(word: str) -> None:
 
 def test_units_of_the_usual_kinds_are_known() -> None:
     assert all(is_unit(unit) for unit in ("mm", "km/h", "MPa", "°", "psi", "-", "kN", "m s-1", "t/mm3"))
+
+
+@pytest.mark.parametrize("name", ["mm-ms-kg", "m-s-kg", "in-us-t", "SI"])
+def test_a_system_keeps_its_name_and_the_si_values_of_its_units(name: str) -> None:
+    system = unit_system(name)
+    assert system.name == name
+    if name != "SI":
+        known = {"mm": 1e-3, "m": 1.0, "in": 0.0254, "ms": 1e-3, "s": 1.0, "us": 1e-6, "kg": 1.0, "t": 1e3}
+        assert [system.length, system.time, system.mass] == [known[piece] for piece in name.split("-")]
+    assert unit_system(name.lower()).factor("length") == system.factor("length")
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor", "label"),
+    [
+        ("J", 1.0, "J"), ("kJ", 1e3, "J"), ("cal", 4.184, "J"), ("Wh", 3600.0, "J"), ("N*m", 1.0, "N m"), ("Nm", 1.0, "N m"),
+        ("kN*mm", 1.0, "N m"), ("rad", 1.0, "rad"), ("mrad", 1e-3, "rad"), ("rad/s", 1.0, "rad s-1"), ("rad/ms", 1e3, "rad s-1"),
+        ("rpm", 2 * 3.14159265358979 / 60, "rad s-1"), ("1/ms", 1e3, "s-1"), ("kHz", 1e3, "s-1"),
+        ("ton", 1e3, "kg"), ("lbm", 0.45359237, "kg"), ("kp", 9.80665, "N"), ("kmh", 1 / 3.6, "m s-1"), ("KM/H", 1 / 3.6, "m s-1"),
+        ("G", 9.80665, "m s-2"), ("g", 1e-3, "kg"), ("ft", 0.3048, "m"), ("sek", 1.0, "s"), ("GRAD", 1.0, "degree"),
+        ("MM", 1e-3, "m"), ("gpa", 1e9, "Pa"), ("N/mm", 1e3, "N m-1"), ("kg/m^3", 1.0, "kg m-3"), ("percent", 1.0, "%"),
+    ],
+)  # fmt: skip
+def test_units_of_mechanics_as_engineers_write_them(unit: str, factor: float, label: str) -> None:
+    found, name = to_si(unit)
+    assert (found, name) == (pytest.approx(factor, rel=1e-9), label)

@@ -162,7 +162,7 @@ def test_times_asked_for_must_lie_in_what_all_runs_cover() -> None:
     times = [seconds(0, 1, 2, 3), seconds(0.5, 1, 2)]
     np.testing.assert_array_equal(common_time(times, seconds(0.5, 2)), [0.5, 2])
     np.testing.assert_array_equal(common_time(times, seconds(0.5 - 1e-6, 2.05)), [0.5 - 1e-6, 2.05])
-    for wanted in (seconds(0.49, 2), seconds(0.5, 2.06)):
+    for wanted in (seconds(0.49, 2), seconds(0.5, 2.06), seconds(0.5, 1, 1.5, 2.06), seconds(0.49)):
         with pytest.raises(DataError, match=r"all runs together cover 0.5 to 2 s"):
             common_time(times, wanted)
 
