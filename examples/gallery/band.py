@@ -4,13 +4,12 @@ import matplotlib.pyplot as plt
 
 import crashkit
 
-runs = crashkit.open_dataset("kart.zarr")
-run, node, model = runs.sel(sim="run_031"), 1616, crashkit.load_model("pod-gpr")
-values = {name: float(run[name]) for name in runs.crash.parameters}
-time, predicted = 1000 * run.time, 100 * crashkit.predict(model, values, full=True).displacement[:, node, 0]
-width = 100 * model.surrogate.band(0.9)[:, node]
-plt.fill_between(time, predicted - width, predicted + width, alpha=0.3, label="90 % band")
-plt.plot(time, predicted, label="prediction")
+run, node = crashkit.open_dataset("kart.zarr").sel(sim="run_031"), 1616
+values = {name: float(run[name]) for name in run.crash.parameters}
+prediction = crashkit.predict("pod-gpr", values, band=0.9).isel(node=node)
+time, x, width = 1000 * run.time, 100 * prediction.displacement[:, 0], 100 * prediction.half_width
+plt.fill_between(time, x - width, x + width, alpha=0.3, label="90 % band")
+plt.plot(time, x, label="prediction")
 plt.plot(time, 100 * run.displacement[:, node, 0], "k--", label="simulation")
 plt.xlabel("time (ms)")
 plt.ylabel("displacement in x (cm)")

@@ -5,11 +5,9 @@ import pyvista as pv
 
 import crashkit
 
-runs = crashkit.open_dataset("kart.zarr")
-run = runs.sel(sim="run_031")
-predicted = crashkit.predict("mh", {name: float(run[name]) for name in runs.crash.parameters}, full=True)
-truth, mesh = run.crash.to_pyvista(), run.crash.surface()
-mesh.points += predicted.values[-1]
+run = crashkit.open_dataset("kart.zarr").sel(sim="run_031")
+prediction = crashkit.predict("mh", {name: float(run[name]) for name in run.crash.parameters})
+truth, mesh = run.crash.to_pyvista(time=0.03), prediction.crash.to_pyvista(time=0.03)
 mesh["error (cm)"] = 100 * np.linalg.norm(mesh.points - truth.points, axis=1)
 plot = pv.Plotter(off_screen=True, window_size=(900, 600))
 plot.add_mesh(truth, color="lightgrey")
