@@ -22,7 +22,7 @@ from crashkit.dataset import open_dataset
 from crashkit.selection import runs_of
 from surrogates.settings import settings
 from surrogates.surrogate import Surrogate
-from surrogates.training.train import train
+from surrogates.training.train import train_surrogate
 
 OFF = ("inputs.derived=off", "physics.clock=off", "physics.symmetry=off")
 
@@ -88,7 +88,7 @@ def fitted(dataset: Path, names: Sequence[str], chosen: Sequence[int], overrides
     """POD-GPR trained on the runs `chosen` alone."""
     others = [name for k, name in enumerate(names) if k not in set(chosen)]
     campaign = open_campaign(dataset, others or None, symmetry="physics.symmetry=off" not in overrides)
-    return train(campaign, settings("pod-gpr", overrides=overrides))
+    return train_surrogate(campaign, settings("pod-gpr", overrides=overrides))
 
 
 def errors(surrogate: Surrogate, dataset: Path, runs: Sequence[int]) -> list[float]:
