@@ -17,12 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from crashkit.api.campaign import open_campaign
+import crashkit
 from crashkit.dataset import open_dataset
 from crashkit.selection import runs_of
-from surrogates.settings import settings
 from surrogates.surrogate import Surrogate
-from surrogates.training.train import train_surrogate
 
 OFF = ("inputs.derived=off", "physics.clock=off", "physics.symmetry=off")
 
@@ -87,8 +85,7 @@ def tables(dataset: Path, test: str, wanted: str, seeds: int, more: Sequence[str
 def fitted(dataset: Path, names: Sequence[str], chosen: Sequence[int], overrides: Sequence[str]) -> Surrogate:
     """POD-GPR trained on the runs `chosen` alone."""
     others = [name for k, name in enumerate(names) if k not in set(chosen)]
-    campaign = open_campaign(dataset, others or None, symmetry="physics.symmetry=off" not in overrides)
-    return train_surrogate(campaign, settings("pod-gpr", overrides=overrides))
+    return crashkit.train(dataset, model="pod-gpr", settings=overrides, test=others or None).surrogate
 
 
 def errors(surrogate: Surrogate, dataset: Path, runs: Sequence[int]) -> list[float]:
