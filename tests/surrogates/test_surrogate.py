@@ -27,7 +27,7 @@ def test_bands_of_own_nodes_and_of_the_full_mesh_survive_storage(model: str, tmp
 
 def test_without_validation_runs_there_is_no_band() -> None:
     fitted = train_surrogate(plate.campaign(6), choose("mh", overrides=(*SHORT, "validation.measure=paper")))
-    with pytest.raises(SurrogateError, match="no band for MH1: too few validation runs"):
+    with pytest.raises(SurrogateError, match="no band for MH1: too few runs"):
         fitted.band()
 
 

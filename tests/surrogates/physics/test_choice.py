@@ -13,6 +13,7 @@ from surrogates.physics.choice import choose
 from surrogates.physics.derived import SPEED, STRESS
 from surrogates.physics.trials import Folds, Trials, courses_of
 from surrogates.settings import Settings, settings
+from surrogates.training.train import train_surrogate
 
 TIME = np.linspace(0.0, 0.03, 16)
 
@@ -107,3 +108,14 @@ def test_every_run_is_left_out_as_often_as_any_other_and_never_trains_then() -> 
             times[held] += 1
         assert len(set(times)) == 1
         assert times[0] == {3: 1, 12: 1, 16: 3, 40: 2, 70: 1}[runs]
+
+
+def test_the_first_state_is_zero_and_the_initial_velocity_is_exact() -> None:
+    """Every run flies freely along x at its own speed: that is learnt from none and kept for all."""
+    surrogate = train_surrogate(crash(24), settings("pod-gpr"))
+    assert not surrogate.registration.clock.is_identity
+    asked = np.array([[11.0, 0.3, 3e8], [30.0, -0.7, 7e8]])
+    u = surrogate.predict(asked)
+    assert np.abs(u[:, 0]).max() < 1e-7
+    flight = asked[:, :1] / 20 * TIME / TIME[-1]
+    np.testing.assert_allclose(u[..., 0].mean(axis=2), flight, atol=2e-5 * flight.max())
