@@ -79,7 +79,7 @@ def test_what_this_package_writes_is_read_back(tmp_path, only_run, sample, suffi
     )  # fmt: skip
     run = only_run(tmp_path / f"run{suffix}")
     assert run.name == "run"
-    assert_is_sample(run, sample, atol=1e-15 if deform else 0.0)
+    assert_is_sample(run, sample, atol=1e-7 if deform else 0.0)  # deformed points are written in single precision
     np.testing.assert_array_equal(run.field("plastic_strain", 1, 3), strain[1:])
     np.testing.assert_array_equal(run.alive(0, 3), alive)
     assert set(run.fields) == {"plastic_strain"}
@@ -424,7 +424,7 @@ def test_pieces_that_count_on_over_cells_that_are_stored_once(tmp_path, only_run
         root["NumberOfPoints"] = [162] * 3
         root["Steps/PartOffsets"][:] = [0, 1, 2]
     run = only_run(file)
-    np.testing.assert_allclose(run.displacement(0, 3), sample.displacement, atol=1e-8)
+    np.testing.assert_allclose(run.displacement(0, 3), sample.displacement, atol=1e-7)
     np.testing.assert_array_equal(run.mesh.face_nodes, sample.faces)
 
 
@@ -448,7 +448,7 @@ def test_the_parts_of_a_collection_become_parts(tmp_path, only_run, sample):
     run = only_run(path)
     assert [(p.name, p.rigid_wall) for p in run.mesh.parts] == [("bumper_beam_1", False), ("RWALL_1", True)]
     np.testing.assert_array_equal(run.mesh.face_nodes[60:], halves[1] + 162)
-    np.testing.assert_allclose(run.displacement(0, 3)[:, 162:], sample.displacement, atol=1e-8)
+    np.testing.assert_allclose(run.displacement(0, 3)[:, 162:], sample.displacement, atol=1e-7)
     strain = run.field("plastic_strain", 0, 3)
     assert (strain[:, :60] == 0.5).all()
     assert np.isnan(strain[:, 60:]).all()
