@@ -20,8 +20,9 @@ from typing import Any
 from crashkit.cli._console import console, say
 
 _ROOMS = ("crashkit", "surrogates", "evaluation")
-SILENCE = 4.5  # seconds without a line, after which one says that the work goes on
-_BETWEEN = 4.0  # seconds between two lines where there is no terminal
+SILENCE = 3.5  # seconds without a line, after which one says that the work goes on
+FIRST = 2.0  # the same for the first line: starting took its time, too
+_BETWEEN = 3.0  # seconds between two lines where there is no terminal
 
 
 def line(what: str, done: int, total: int, note: str, left: float | None) -> str:
@@ -52,6 +53,7 @@ class Progress:
         self._last = self._since = time.monotonic()
         self._end = threading.Event()
         self._shown: Any = None
+        self._levels: dict[str, int] = {}
 
     def __enter__(self) -> Progress:
         if self._quiet:
@@ -59,6 +61,7 @@ class Progress:
         self._handler = _Listener(self)
         for name in _ROOMS:
             logger = logging.getLogger(name)
+            self._levels[name] = logger.level
             logger.addHandler(self._handler)
             if logger.getEffectiveLevel() > logging.INFO:
                 logger.setLevel(logging.INFO)
@@ -76,6 +79,7 @@ class Progress:
         self._end.set()
         for name in _ROOMS:
             logging.getLogger(name).removeHandler(self._handler)
+            logging.getLogger(name).setLevel(self._levels[name])
         if self._shown is not None:
             self._shown.stop()
 
@@ -124,7 +128,7 @@ class Progress:
                 seconds = now - self._since
                 if self._shown is not None and seconds > 1:
                     self._shown.update(_fitted(f"{self._text} ({seconds:.0f} s)"))
-                elif self._shown is None and now - self._last >= SILENCE:
+                elif self._shown is None and now - self._last >= (SILENCE if self._said else FIRST):
                     self._print(f"{self._text} ... {seconds:.0f} s")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -54,6 +55,8 @@ def command(
     given = list(settings or ())
     if odd:
         given.append(f"physics.odd=[{odd}]")
+    if not json:
+        _name_dead(output, resume)
     with Progress(f"reading {dataset}", quiet=json) as shown:
         surrogate = train(
             dataset, output, model or None, preset=preset or None, settings=given, config=config, seed=seed,
@@ -69,10 +72,32 @@ def command(
     elif surrogate.record.held_out_runs:
         what_next(output / "card.md", ("evaluate", dataset, output, "-o", "report"))
     else:
-        first = {n: f"{a:.4g}" for n, a in zip(surrogate.record.ranges.names, surrogate.record.ranges.low, strict=True)}
+        ranges = surrogate.record.ranges
+        middle = (ranges.low + ranges.high) / 2
+        first = {n: f"{m / f:.4g}" for n, m, (_, f) in zip(ranges.names, middle, ranges.written, strict=True)}
         what_next(
             output / "card.md", ("predict", output, *(x for n, a in first.items() for x in ("--param", f"{n}={a}")))
         )
+
+
+# A living training writes its state every half minute.
+_DEAD_AFTER = 600.0
+
+
+def _name_dead(output: Path, resume: bool) -> None:
+    """Say what trainings that were killed have left beside `output`, and what can be done with it."""
+    for left in sorted(output.absolute().parent.glob(".*.training")):
+        files = [f.stat() for f in left.glob("*") if f.is_file()]
+        name = left.name.removeprefix(".").removesuffix(".training")
+        if not files or (name == output.name and resume) or time.time() - max(f.st_mtime for f in files) < _DEAD_AFTER:
+            continue
+        size = sum(f.st_size for f in files) / 1e6
+        what = (
+            "is replaced now"
+            if name == output.name
+            else f"goes on with -o {output.with_name(name)} --resume; else delete it"
+        )
+        say(f"note: {left.name} ({size:.1f} MB) is left of a training that was killed: it {what}")
 
 
 def epoch_lines(shown: Progress, verbose: bool = False) -> Callable[[Epoch], None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import warnings
@@ -391,3 +392,17 @@ def test_export_writes_a_checked_file(model: Path, tmp_path: Path) -> None:
 
 def test_the_loaded_model_is_a_surrogate(model: Path) -> None:
     assert isinstance(crashkit.load_model(model).surrogate, Surrogate)
+
+
+def test_what_a_killed_training_left_is_named(crash: Path, tmp_path: Path) -> None:
+    left = tmp_path / ".old.training"
+    left.mkdir()
+    (left / "training.json").write_text("{}")
+    wanted = ("train", crash, "-o", tmp_path / "m", "--model", "podnn", "--epochs", 1, "--test", "8:10")
+    assert ".old.training" not in run(*wanted)[2]  # written just now: it may be alive
+    os.utime(left / "training.json", (0, 0))
+    _, _, err = run(*wanted, "--overwrite")
+    assert re.search(
+        r"note: \.old\.training .* is left of a training that was killed: it goes on with -o .*old --resume", err
+    )
+    assert f"next     crashkit evaluate {crash} {tmp_path / 'm'} -o report" in err

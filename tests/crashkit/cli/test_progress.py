@@ -1,0 +1,86 @@
+"""Progress: one shape, eighty columns, never silent, stages from below through logging."""
+
+from __future__ import annotations
+
+import logging
+import time
+
+import pytest
+
+from crashkit.cli import _progress
+from crashkit.cli._console import print_json, say
+from crashkit.cli._progress import Progress, line
+
+
+def test_a_line_of_training_fits_eighty_columns() -> None:
+    said = line("MH3", 120, 300, "validation 1.65 cm (best 1.65, epoch 21)", 38.2)
+    assert said == "MH3 120/300 | validation 1.65 cm (best 1.65, epoch 21) | 38 s left"
+    assert len(said) <= 80
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("ingest", 0, 0, "looking at run_1", None), "ingest | looking at run_1"),
+        (("ingest", 36, 36, "", 0.0), "ingest 36/36"),
+        (("figures", 2, 19, "", 300.0), "figures 2/19 | 5 min left"),
+    ],
+)
+def test_what_is_not_known_is_left_out(arguments: tuple, said: str) -> None:
+    assert line(*arguments) == said
+
+
+def test_work_that_says_nothing_is_spoken_for(capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+    monkeypatch.setattr(_progress, "FIRST", 0.05)
+    monkeypatch.setattr(_progress, "SILENCE", 0.05)
+    with Progress("reading kart.zarr"):
+        time.sleep(1.0)
+    assert capsys.readouterr().err.count("reading kart.zarr ... ") >= 2
+
+
+def test_with_json_nothing_is_said(capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+    monkeypatch.setattr(_progress, "FIRST", 0.0)
+    with Progress("reading", quiet=True) as shown:
+        shown.step("runs", 3, 3)
+        time.sleep(0.4)
+    assert capsys.readouterr().err == ""
+
+
+def test_what_the_rooms_log_becomes_a_stage_and_the_loggers_are_left_as_they_were(
+    capsys: pytest.CaptureFixture[str], monkeypatch
+) -> None:
+    monkeypatch.setattr(_progress, "SILENCE", 0.05)
+    logger = logging.getLogger("surrogates")
+    before = list(logger.handlers), logger.level
+    with Progress("starting"):
+        logging.getLogger("surrogates.models").info("fitting Gaussian processes")
+        logging.getLogger("evaluation.figures").warning("a figure cannot be loaded")
+        time.sleep(0.6)
+    told = capsys.readouterr().err
+    assert "fitting Gaussian processes" in told
+    assert "warning: a figure cannot be loaded" in told
+    assert (list(logger.handlers), logger.level) == before
+
+
+def test_finished_work_is_said_once(capsys: pytest.CaptureFixture[str]) -> None:
+    with Progress("starting") as shown:
+        for k in range(1, 4):
+            shown.step("runs", k, 3)
+        shown.step("runs", 3, 3)
+    assert capsys.readouterr().err == "runs 3/3\n"
+
+
+def test_json_has_neither_nan_nor_infinity(capsys: pytest.CaptureFixture[str]) -> None:
+    print_json({"a": float("nan"), "b": [float("inf"), -float("inf"), 1.5]})
+    assert capsys.readouterr().out.split() == ["{", '"a":', "null,", '"b":', "[", "null,", "null,", "1.5", "]", "}"]
+
+
+def test_names_that_the_terminal_cannot_show_do_not_end_a_command(monkeypatch) -> None:
+    import io
+    import sys
+
+    stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stderr", stream)
+    say("run Längsträger")
+    stream.flush()
+    assert stream.buffer.getvalue() == b"run L\\xe4ngstr\\xe4ger\n"
