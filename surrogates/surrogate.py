@@ -35,10 +35,16 @@ def level_name(settings: Settings, number: int) -> str:
 class Surrogate:
     """A fitted surrogate.
 
-    settings, record  what it was asked to be, and what became of it
-    graphs            the levels it knows; with them predictions are lifted to the full mesh without the data
-    points, faces     the full mesh (node, 3), m, and (face, corner), where the training data told them
-    labels            the solver's numbers and names on it, where the training data told them
+    Attributes
+    ----------
+    settings, record
+        What it was asked to be, and what became of it.
+    graphs
+        The levels it knows; with them predictions are lifted to the full mesh without the data.
+    points, faces
+        The full mesh (node, 3), m, and (face, corner), where the training data told them.
+    labels
+        The solver's numbers and names on it, where the training data told them.
     """
 
     def __init__(
@@ -68,10 +74,17 @@ class Surrogate:
     ) -> NDArray[np.float32]:
         """Displacements, m, on the nodes of `level` (default: the finest one it has).
 
-        parameters  (p,) -> (state, node, 3), or (batch, p) -> (batch, state, node, 3), in the units it was trained with
-        time        (state,) s, any times; default: those it was trained on
+        Parameters
+        ----------
+        parameters
+            (p,) -> (state, node, 3), or (batch, p) -> (batch, state, node, 3), in the units it was trained with.
+        time
+            (state,) s, any times; default: those it was trained on.
 
-        Raises SurrogateError for a level it does not have, or parameters of the wrong number or not finite.
+        Raises
+        ------
+        SurrogateError
+            For a level it does not have, or parameters of the wrong number or not finite.
         """
         number = self.number(level)
         values, times = self.checked(parameters, time)
@@ -149,9 +162,14 @@ class Surrogate:
     ) -> NDArray[np.float32]:
         """How far, m, the true node may lie from the predicted one: (state, node of `level` or of the full mesh).
 
-        The share `coverage` of nodes and states of a new run lies within it, as far as the runs tell that were left out;
-        see `surrogates.uncertainty`. With `parameters` (parameter,) it is the band of that run, wider where the model
-        itself knows less; without, that of a typical run. Raises SurrogateError where there were too few runs.
+        The share `coverage` of nodes and states of a new run lies within it, as far as the runs tell that were left
+        out; see `surrogates.uncertainty`. With `parameters` (parameter,) it is the band of that run, wider where the
+        model itself knows less; without, that of a typical run.
+
+        Raises
+        ------
+        SurrogateError
+            Where there were too few runs.
         """
         number = self.number(level)
         found = self.bands.get((number, full and number > 0))
@@ -276,11 +294,15 @@ def sensitivity(
 ) -> NDArray[np.float32]:
     """Derivatives of displacements by the parameters, m per unit of the parameter: (state, node, 3, parameter).
 
-    parameters  (parameter,), time (state,) s and level as in `Surrogate.predict`
-    nodes       node numbers on the level; default: all
-
     Networks are differentiated automatically, in forward mode; Gaussian processes, radial basis functions and whatever
     stands behind a registration by central differences over a thousandth of the trained range.
+
+    Parameters
+    ----------
+    parameters
+        (parameter,), time (state,) s and level as in `Surrogate.predict`.
+    nodes
+        Node numbers on the level; default: all.
     """
     number = surrogate.number(level)
     values, times = surrogate.checked(parameters, time)

@@ -316,7 +316,10 @@ def _reader(path: str, dataset: xr.Dataset) -> Callable[[int], NDArray[np.float3
 class StoredLevel:
     """One level of a stored surrogate as evaluation asks it (evaluation.comparison.predictor.Predictor).
 
-    order  for each parameter of the surrogate, its place among those of the dataset
+    Attributes
+    ----------
+    order
+        For each parameter of the surrogate, its place among those of the dataset.
     """
 
     surrogate: Surrogate
@@ -347,7 +350,10 @@ class StoredLevel:
 def as_model(surrogate: Surrogate, folder: Path, reference: Reference) -> Model:
     """A surrogate, stored in `folder`, as evaluation sees it: one predictor a level, and the runs it has seen.
 
-    Raises EvaluationError where its parameters, nodes or levels are not those of the dataset.
+    Raises
+    ------
+    EvaluationError
+        Where its parameters, nodes or levels are not those of the dataset.
     """
     from evaluation.comparison.predictor import Model
     from evaluation.errors import EvaluationError

@@ -24,10 +24,16 @@ Say = Callable[[str], None]
 class CampaignSummary:
     """What a call of `run_campaign` did.
 
-    folder, dataset, model, page  where everything is; model is None where none was asked for
-    done, failed, refused         runs of the whole campaign
-    judgement                     error over the box with its interval, m; None where nothing was judged
-    why                           why the campaign ended
+    Attributes
+    ----------
+    folder, dataset, model, page
+        Where everything is; model is None where none was asked for.
+    done, failed, refused
+        Runs of the whole campaign.
+    judgement
+        Error over the box with its interval, m; None where nothing was judged.
+    why
+        Why the campaign ended.
     """
 
     folder: Path
