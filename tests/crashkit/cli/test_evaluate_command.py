@@ -293,3 +293,15 @@ def test_a_figure_that_cannot_be_loaded_does_not_stop_the_others(forgetful, monk
     figures._load_entry_points.cache_clear()
     assert [kind.name for kind in figures.kinds()] == list(figures.ORDER)
     assert "figure broken (no.such:module) cannot be loaded" in caplog.text
+
+
+def test_a_report_is_replaced_only_when_asked(campaign, small, tmp_path):
+    wanted = (campaign / "kart.zarr", campaign / "podnn", "-o", tmp_path / "report")
+    assert run(*wanted).exit_code == 0
+    (tmp_path / "report" / "mine.txt").write_text("a remark")
+    _fails(run(*wanted), "holds a report already", "--overwrite")
+    assert (tmp_path / "report" / "mine.txt").exists()
+    result = run(*wanted, "--overwrite")
+    assert result.exit_code == 0, result.output
+    lines = [line for line in result.stderr.splitlines() if line.startswith("warning: ")]
+    assert any("Few test runs" in line for line in lines)
