@@ -99,13 +99,13 @@ def dataset_of(
     view, s, lock = RunView(run, structure, system), structure, threading.Lock()
     states, sizes = len(run.time), {"node": s.n_nodes, "face": len(s.face_nodes), "cell": len(s.cell_nodes)}
 
-    def lazy(read: Callable[[int, int], NDArray], dtype: Any, *shape: int) -> indexing.LazilyIndexedArray:
+    def lazy(read: Callable[[int, int], NDArray[Any]], dtype: Any, *shape: int) -> indexing.LazilyIndexedArray:
         return indexing.LazilyIndexedArray(_Lazy(read, (1, states, *shape), np.dtype(dtype), lock))
 
     def measured(unit: str) -> dict[str, str]:
         return {"units": unit} if name else {}
 
-    def displacement(first: int, last: int) -> NDArray:
+    def displacement(first: int, last: int) -> NDArray[Any]:
         values = view.displacement(first, last)
         gone = gone_nodes(s, *view.alive(first, last), last - first)
         if gone is not None:
@@ -166,10 +166,10 @@ def dataset_of(
     return ds
 
 
-def _flags(view: RunView, place: int) -> Callable[[int, int], NDArray]:
+def _flags(view: RunView, place: int) -> Callable[[int, int], NDArray[Any]]:
     """A function that gives `alive` (place 0) or `cell_alive` (place 1) of some states."""
 
-    def read(first: int, last: int) -> NDArray:
+    def read(first: int, last: int) -> NDArray[Any]:
         return np.asarray(view.alive(first, last)[place])
 
     return read
@@ -205,7 +205,7 @@ class _Lazy(BackendArray):
     """(1, state, ...) values of one run; `read(first, last)` gives a range of states."""
 
     def __init__(
-        self, read: Callable[[int, int], NDArray], shape: tuple[int, ...], dtype: np.dtype, lock: threading.Lock
+        self, read: Callable[[int, int], NDArray[Any]], shape: tuple[int, ...], dtype: np.dtype, lock: threading.Lock
     ) -> None:
         self._read, self._lock = read, lock
         self.shape, self.dtype = shape, dtype
@@ -213,7 +213,7 @@ class _Lazy(BackendArray):
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
         return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.BASIC, self._get)
 
-    def _get(self, key: tuple[Any, ...]) -> NDArray:
+    def _get(self, key: tuple[Any, ...]) -> NDArray[Any]:
         sim, state, *others = key
         is_slice = isinstance(state, slice)
         wanted = list(range(self.shape[1])[state]) if is_slice else [range(self.shape[1])[int(state)]]

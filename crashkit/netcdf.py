@@ -23,7 +23,7 @@ _LOCK = threading.RLock()
 _OPEN: dict[tuple[str, int, int, int], list[Any]] = {}
 
 
-class SharedFile(FileManager):  # type: ignore[misc]
+class SharedFile(FileManager):  # type: ignore[type-arg]
     """A hold on the one handle of a file; the last one that lets go closes it. Can be sent to another process."""
 
     def __init__(self, path: str | Path) -> None:
@@ -41,7 +41,8 @@ class SharedFile(FileManager):  # type: ignore[misc]
         self._key = key
 
     def acquire(self, needs_lock: bool = True) -> netCDF4.Dataset:
-        return self._handle
+        handle: netCDF4.Dataset = self._handle
+        return handle
 
     @contextlib.contextmanager
     def acquire_context(self, needs_lock: bool = True) -> Iterator[netCDF4.Dataset]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +51,7 @@ class BlockDigest:
     is_default: bool
 
 
-def block_digest(block: NDArray) -> BlockDigest:
+def block_digest(block: NDArray[Any]) -> BlockDigest:
     """Digest of a block; the default is True for bools (alive) and NaN for numbers (missing)."""
     plain = np.ascontiguousarray(block, dtype=block.dtype.newbyteorder("<"))
     is_default = plain.all() if plain.dtype.kind == "b" else np.isnan(plain.flat[:1]).all() and np.isnan(plain).all()
@@ -79,7 +79,7 @@ def results(dataset: xr.Dataset) -> list[str]:
     return [n for n in ("displacement", "alive", "cell_alive", *fields(dataset)) if n in dataset.variables]
 
 
-def result_blocks(variable: xr.DataArray) -> Iterator[tuple[int, int, NDArray]]:
+def result_blocks(variable: xr.DataArray) -> Iterator[tuple[int, int, NDArray[Any]]]:
     """(first, last, values (time, nodes, ...)) for one run's variable (time, node | face | cell, ...)."""
     entry = variable.dtype.itemsize * int(np.prod(variable.shape[2:], dtype=np.int64))
     for first, last in blocks(variable.shape[0], variable.shape[1], entry):
@@ -103,7 +103,7 @@ def shared(dataset: xr.Dataset) -> list[str]:
 def dataset_checksum(
     dataset: xr.Dataset,
     run_checksums: Iterable[str],
-    positions: Callable[[int], NDArray] | None = None,
+    positions: Callable[[int], NDArray[Any]] | None = None,
 ) -> str:
     """SHA-256 of a dataset whose runs have the given checksums, in their order; reads the small variables only.
 
@@ -125,7 +125,7 @@ def dataset_checksum(
     return _of(lines)
 
 
-def _array(values: NDArray) -> str:
+def _array(values: NDArray[Any]) -> str:
     """SHA-256 of shape and content, whatever the width of the numbers, or how text is kept."""
     if values.dtype.kind in "OTU":
         content = "\0".join(map(str, values.ravel())).encode()

@@ -78,4 +78,4 @@ def lift(to_full: sparse.csr_matrix, states: NDArray[np.floating]) -> NDArray[np
             f"the upsampling takes {to_full.shape[1]} nodes and the field has {nodes}; expected those of its level"
         )
     rows = to_full.astype(states.dtype, copy=False) @ states.transpose(1, 2, 0).reshape(nodes, -1)
-    return rows.reshape(-1, 3, count).transpose(2, 0, 1)
+    return np.asarray(rows.reshape(-1, 3, count).transpose(2, 0, 1))

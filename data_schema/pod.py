@@ -41,7 +41,7 @@ class Pod:
     @property
     def normalised(self) -> NDArray[np.float64]:
         """Singular values divided by the first."""
-        return self.singular_values / self.singular_values[0]
+        return np.asarray(self.singular_values / self.singular_values[0])
 
     def coefficients(self, run: NDArray[np.float32]) -> NDArray[np.float32]:
         """(state, node, 3) -> (state, mode)"""

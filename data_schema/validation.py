@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -209,7 +209,7 @@ class _DisplacementChecks:
         self._start = 0.0
         self._moves = dataset.sizes["time"] == 1
 
-    def look_at(self, first: int, block: NDArray) -> None:
+    def look_at(self, first: int, block: NDArray[Any]) -> None:
         bad = ~np.isfinite(block).all(axis=-1)
         gone = self._gone[:, first : first + block.shape[1]]
         self._first_bad = _first(bad & ~gone, first, self._first_bad)

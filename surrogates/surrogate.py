@@ -330,11 +330,12 @@ def _forward_mode(
     when = torch.from_numpy(times)
 
     def states(parameters: Tensor) -> Tensor:
-        return network(parameters, when, number)
+        result: Tensor = network(parameters, when, number)
+        return result
 
     with exportable(network), torch.no_grad():
         moved = torch.func.jvp(states, (at.contiguous(),), (direction,))[1]
-    return moved.transpose(0, 1).numpy()
+    return np.asarray(moved.transpose(0, 1).numpy())
 
 
 def _central(
@@ -347,4 +348,4 @@ def _central(
     there = np.repeat(values[None], 2, axis=0)
     there[:, k] += (-step, step)
     states = surrogate.predict(there, times, number).astype(np.float64)
-    return (states[1] - states[0]) / (2 * step)
+    return np.asarray((states[1] - states[0]) / (2 * step))

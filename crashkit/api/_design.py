@@ -85,7 +85,7 @@ class Known:
         """(point,): what the process believes its error to be at points of the box, up to a factor."""
         core, registration = _process(self.surrogate)
         parameters = self.parameters(points)
-        return core.deviation(registration.read(parameters)) * self.size(parameters)
+        return np.asarray(core.deviation(registration.read(parameters)) * self.size(parameters))
 
     def size(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
         """(point,): how large errors at (point, parameter) are for one unit of the process's deviation, up to a factor.

@@ -128,7 +128,8 @@ def read_box(path: str | Path) -> Box:
     CampaignError
         Where the file cannot be read or says something else.
     """
-    return checked(Box, {k: v for k, v in read_yaml(path).items() if k in ("parameters", "constraints")}, path)
+    box: Box = checked(Box, {k: v for k, v in read_yaml(path).items() if k in ("parameters", "constraints")}, path)
+    return box
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,8 +78,8 @@ def same_time(own: NDArray[np.float64], common: NDArray[np.float64]) -> bool:
 
 
 def interpolate(
-    values: NDArray, own: NDArray[np.float64], common: NDArray[np.float64], *, cubic: bool = True
-) -> NDArray:
+    values: NDArray[Any], own: NDArray[np.float64], common: NDArray[np.float64], *, cubic: bool = True
+) -> NDArray[Any]:
     """`values` (own state, ...) at the `common` times; NaN behind what the last state stands for (`reach`).
 
     Cubic: Hermite polynomials whose slopes are those of the parabola through a state and its neighbours (Catmull-Rom
@@ -102,7 +103,7 @@ def interpolate(
     return out
 
 
-def interpolation_error(values: NDArray, own: NDArray[np.float64], common: NDArray[np.float64]) -> float:
+def interpolation_error(values: NDArray[Any], own: NDArray[np.float64], common: NDArray[np.float64]) -> float:
     """Estimated largest error of the cubic interpolation, as length of a vector `values` (own state, ..., 3).
 
     Every own state is predicted from its neighbours alone, at twice the step, and compared; the larger miss at the
@@ -136,7 +137,7 @@ def flags_at(flags: NDArray[np.bool_], own: NDArray[np.float64], common: NDArray
     left, fraction = _places(own, common)
     right = np.minimum(left + 1, len(own) - 1)
     shape = (-1,) + (1,) * (flags.ndim - 1)
-    return (flags[left] | (fraction == 1).reshape(shape)) & (flags[right] | (fraction == 0).reshape(shape))
+    return np.asarray((flags[left] | (fraction == 1).reshape(shape)) & (flags[right] | (fraction == 0).reshape(shape)))
 
 
 def _places(own: NDArray[np.float64], common: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -151,25 +152,25 @@ def _places(own: NDArray[np.float64], common: NDArray[np.float64]) -> tuple[NDAr
     return left, fraction
 
 
-def _hermite(values: NDArray, own: NDArray[np.float64], n: int, f: float) -> NDArray:
+def _hermite(values: NDArray[Any], own: NDArray[np.float64], n: int, f: float) -> NDArray[Any]:
     """Cubic Hermite polynomial between states n and n + 1 at the fraction f; a line where a neighbour is no number."""
     h = float(own[n + 1] - own[n])
     a, b = values[n], values[n + 1]
     straight = a * (1 - f) + b * f
     if len(own) < 3:
-        return straight
+        return np.asarray(straight)
     slope_a, slope_b = _slope(values, own, n), _slope(values, own, n + 1)
     ends, slopes = np.stack([a, b]), np.stack([slope_a, slope_b])
     known = np.isfinite(ends).all(axis=0) & np.isfinite(slopes).all(axis=0)
     spline = CubicHermiteSpline([0.0, h], np.where(known, ends, 0.0), np.where(known, slopes, 0.0))
-    return np.where(known, spline(f * h).astype(values.dtype), straight)
+    return np.asarray(np.where(known, spline(f * h).astype(values.dtype), straight))
 
 
-def _slope(values: NDArray, own: NDArray[np.float64], n: int) -> NDArray:
+def _slope(values: NDArray[Any], own: NDArray[np.float64], n: int) -> NDArray[Any]:
     """Slope at state n of the parabola through it and its neighbours (the nearest three states at the ends)."""
     m = min(max(n, 1), len(own) - 2)
     before, after = float(own[m] - own[m - 1]), float(own[m + 1] - own[m])
     first, second = (values[m] - values[m - 1]) / before, (values[m + 1] - values[m]) / after
     bend = (second - first) / (before + after)
-    slope: NDArray = first + bend * (before + 2 * float(own[n] - own[m]))
+    slope: NDArray[Any] = first + bend * (before + 2 * float(own[n] - own[m]))
     return slope

@@ -244,7 +244,7 @@ def _create(
     return variable
 
 
-def _stored_blocks(source: RunSource, spec: ArraySpec) -> Iterator[tuple[tuple[slice, ...], NDArray]]:
+def _stored_blocks(source: RunSource, spec: ArraySpec) -> Iterator[tuple[tuple[slice, ...], NDArray[Any]]]:
     """(where, values) of a run's array, block by block; the fill value where the run has no such array."""
     import zarr
 
@@ -262,7 +262,7 @@ def _stored_blocks(source: RunSource, spec: ArraySpec) -> Iterator[tuple[tuple[s
             yield where, np.full(shape, spec.fill, spec.dtype)
 
 
-def read_array(source: RunSource, name: str) -> NDArray:
+def read_array(source: RunSource, name: str) -> NDArray[Any]:
     """A run's whole array."""
     import zarr
 

@@ -366,7 +366,7 @@ class _Turn:
             for state in range(self._shape[0]):
                 if self._file is not None:
                     self._file.seek((state * self._shape[1] + part.start) * self._entry)
-                    self._file.readinto(out[state].data.cast("B"))  # type: ignore[attr-defined]
+                    self._file.readinto(out[state].data.cast("B"))
         return out
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,7 +11,7 @@ from crashkit.mesh._compiled import compiled
 
 
 @compiled
-def _on_segment(points: NDArray, i: int, at: NDArray, a: int, b: int) -> float:
+def _on_segment(points: NDArray[Any], i: int, at: NDArray[Any], a: int, b: int) -> float:
     """Weight of b at the point of the segment a-b closest to point i."""
     along = 0.0
     length2 = 0.0
@@ -23,7 +25,7 @@ def _on_segment(points: NDArray, i: int, at: NDArray, a: int, b: int) -> float:
 
 
 @compiled
-def _to_segment2(points: NDArray, i: int, at: NDArray, a: int, b: int, t: float) -> float:
+def _to_segment2(points: NDArray[Any], i: int, at: NDArray[Any], a: int, b: int, t: float) -> float:
     """Squared distance of point i to the point (1 - t) a + t b."""
     total = 0.0
     for k in range(3):
@@ -34,7 +36,7 @@ def _to_segment2(points: NDArray, i: int, at: NDArray, a: int, b: int, t: float)
 
 @compiled
 def closest_weights(
-    points: NDArray, i: int, at: NDArray, cells: NDArray, cell: int
+    points: NDArray[Any], i: int, at: NDArray[Any], cells: NDArray[Any], cell: int
 ) -> tuple[float, float, float, float]:
     """Barycentric weights of the point of a cell closest to point i, clamped to the cell, and its squared distance.
 
@@ -82,9 +84,9 @@ def closest_weights(
 
 @compiled
 def settle(
-    points: NDArray, start: NDArray, candidate: NDArray, at: NDArray, cells: NDArray, cell_start: NDArray,
-    cell_list: NDArray, near_start: NDArray, near_list: NDArray, hops: int,
-) -> tuple[NDArray, NDArray]:  # fmt: skip
+    points: NDArray[Any], start: NDArray[Any], candidate: NDArray[Any], at: NDArray[Any], cells: NDArray[Any], cell_start: NDArray[Any],
+    cell_list: NDArray[Any], near_start: NDArray[Any], near_list: NDArray[Any], hops: int,
+) -> tuple[NDArray[Any], NDArray[Any]]:  # fmt: skip
     """Weights of each point on its cell, taking `candidate` where the graph agrees that it is near.
 
     points (n, 3); start (n,): the coarse node that stands for each point; candidate (n,): closest cell found without

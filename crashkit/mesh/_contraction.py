@@ -6,6 +6,8 @@ faces and graph edges hang in linked lists, and every vertex waits in one binary
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,24 +17,27 @@ _NONE = -1
 
 
 @compiled
-def _evaluate(q: NDArray, x: float, y: float, z: float) -> float:
+def _evaluate(q: NDArray[Any], x: float, y: float, z: float) -> float:
     """v^T Q v of a quadric stored as xx xy xz xw yy yz yw zz zw ww."""
-    return (
+    value: float = (
         q[0] * x * x + 2 * q[1] * x * y + 2 * q[2] * x * z + 2 * q[3] * x
         + q[4] * y * y + 2 * q[5] * y * z + 2 * q[6] * y
         + q[7] * z * z + 2 * q[8] * z + q[9]
     )  # fmt: skip
+    return value
 
 
 @compiled
-def _less(cost: NDArray, tie: NDArray, a: int, b: int) -> bool:
+def _less(cost: NDArray[Any], tie: NDArray[Any], a: int, b: int) -> bool:
     if cost[a] != cost[b]:
-        return cost[a] < cost[b]
-    return tie[a] < tie[b]
+        return bool(cost[a] < cost[b])
+    return bool(tie[a] < tie[b])
 
 
 @compiled
-def _sift_down(heap: NDArray, where: NDArray, cost: NDArray, tie: NDArray, k: int, size: int) -> None:
+def _sift_down(
+    heap: NDArray[Any], where: NDArray[Any], cost: NDArray[Any], tie: NDArray[Any], k: int, size: int
+) -> None:
     v = heap[k]
     while True:
         child = 2 * k + 1
@@ -50,7 +55,7 @@ def _sift_down(heap: NDArray, where: NDArray, cost: NDArray, tie: NDArray, k: in
 
 
 @compiled
-def _sift(heap: NDArray, where: NDArray, cost: NDArray, tie: NDArray, k: int, size: int) -> None:
+def _sift(heap: NDArray[Any], where: NDArray[Any], cost: NDArray[Any], tie: NDArray[Any], k: int, size: int) -> None:
     """Put the entry at place k of the first `size`, whose cost changed, where it belongs."""
     v = heap[k]
     while k > 0:
@@ -67,7 +72,7 @@ def _sift(heap: NDArray, where: NDArray, cost: NDArray, tie: NDArray, k: int, si
 
 @compiled
 def _flips(
-    p: int, q: int, position: NDArray, faces: NDArray, face_head: NDArray, face_next: NDArray
+    p: int, q: int, position: NDArray[Any], faces: NDArray[Any], face_head: NDArray[Any], face_next: NDArray[Any]
 ) -> int:  # fmt: skip
     """How many of p's surviving faces would turn over if p moved to q."""
     count = 0
@@ -104,7 +109,7 @@ def _flips(
 
 
 @compiled
-def _holds_all(parts: NDArray, p: int, q: int) -> bool:
+def _holds_all(parts: NDArray[Any], p: int, q: int) -> bool:
     """Whether q lies on every part that p lies on."""
     for w in range(parts.shape[1]):  # noqa: SIM110 - numba compiles no generator here
         if parts[p, w] & ~parts[q, w]:
@@ -114,8 +119,8 @@ def _holds_all(parts: NDArray, p: int, q: int) -> bool:
 
 @compiled
 def _best(
-    p: int, position: NDArray, quadric: NDArray, faces: NDArray, face_head: NDArray, face_next: NDArray,
-    half_to: NDArray, half_head: NDArray, half_next: NDArray, parts: NDArray, join_parts: bool, flip: float,
+    p: int, position: NDArray[Any], quadric: NDArray[Any], faces: NDArray[Any], face_head: NDArray[Any], face_next: NDArray[Any],
+    half_to: NDArray[Any], half_head: NDArray[Any], half_next: NDArray[Any], parts: NDArray[Any], join_parts: bool, flip: float,
 ) -> tuple[float, int]:  # fmt: skip
     """Cheapest contraction p -> q, as (cost, q); q is -1 where none is allowed."""
     best, target = np.inf, _NONE
@@ -134,7 +139,7 @@ def _best(
 
 
 @compiled
-def _unlink_corner(c: int, faces: NDArray, face_head: NDArray, face_next: NDArray) -> None:
+def _unlink_corner(c: int, faces: NDArray[Any], face_head: NDArray[Any], face_next: NDArray[Any]) -> None:
     v = faces[c // 3, c % 3]
     at = face_head[v]
     if at == c:
@@ -146,7 +151,7 @@ def _unlink_corner(c: int, faces: NDArray, face_head: NDArray, face_next: NDArra
 
 
 @compiled
-def _drop_half(v: int, h: int, half_head: NDArray, half_next: NDArray) -> None:
+def _drop_half(v: int, h: int, half_head: NDArray[Any], half_next: NDArray[Any]) -> None:
     at = half_head[v]
     if at == h:
         half_head[v] = half_next[h]
@@ -158,7 +163,7 @@ def _drop_half(v: int, h: int, half_head: NDArray, half_next: NDArray) -> None:
 
 @compiled
 def _has_twin(
-    q: int, a: int, b: int, part: int, faces: NDArray, face_part: NDArray, face_head: NDArray, face_next: NDArray
+    q: int, a: int, b: int, part: int, faces: NDArray[Any], face_part: NDArray[Any], face_head: NDArray[Any], face_next: NDArray[Any]
 ) -> bool:  # fmt: skip
     """Whether q already carries a face of this part with the corners q, a, b."""
     c = face_head[q]
@@ -175,9 +180,9 @@ def _has_twin(
 
 @compiled
 def contract(
-    position: NDArray, quadric: NDArray, faces: NDArray, face_part: NDArray, edges: NDArray, is_pair: NDArray,
-    parts: NDArray, tie: NDArray, locked: NDArray, count: int, join_parts: bool, flip: float,
-) -> tuple[NDArray, NDArray, NDArray]:  # fmt: skip
+    position: NDArray[Any], quadric: NDArray[Any], faces: NDArray[Any], face_part: NDArray[Any], edges: NDArray[Any], is_pair: NDArray[Any],
+    parts: NDArray[Any], tie: NDArray[Any], locked: NDArray[Any], count: int, join_parts: bool, flip: float,
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:  # fmt: skip
     """Contract p -> q, cheapest first, until `count` vertices are left or no contraction is allowed.
 
     position (n, 3), quadric (n, 10), faces (m, 3) int32, face_part (m,) int32, edges (e, 2) int32 without doubles,
@@ -318,8 +323,8 @@ def contract(
 
 @compiled
 def graph_distances(
-    pairs: NDArray, limit: NDArray, position: NDArray, near_start: NDArray, near_list: NDArray
-) -> NDArray:
+    pairs: NDArray[Any], limit: NDArray[Any], position: NDArray[Any], near_start: NDArray[Any], near_list: NDArray[Any]
+) -> NDArray[Any]:
     """Length of the shortest way along the graph between the two vertices of each pair; inf where above `limit`.
 
     pairs (m, 2), limit (m,), position (n, 3); neighbours of v: near_list[near_start[v]:near_start[v + 1]].

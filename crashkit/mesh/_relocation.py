@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,15 +18,15 @@ class Coarse(NamedTuple):
     nodes that were contracted into it.
     """
 
-    at: NDArray
-    cells: NDArray
-    cell_part: NDArray
-    cell_start: NDArray
-    cell_list: NDArray
-    near_start: NDArray
-    near_list: NDArray
-    member_start: NDArray
-    member_list: NDArray
+    at: NDArray[Any]
+    cells: NDArray[Any]
+    cell_part: NDArray[Any]
+    cell_start: NDArray[Any]
+    cell_list: NDArray[Any]
+    near_start: NDArray[Any]
+    near_list: NDArray[Any]
+    member_start: NDArray[Any]
+    member_list: NDArray[Any]
 
 
 class Finer(NamedTuple):
@@ -36,17 +36,17 @@ class Finer(NamedTuple):
     are; into (n,): coarse vertex each belongs to; graph neighbours.
     """
 
-    at: NDArray
-    weight: NDArray
-    parts: NDArray
-    kind: NDArray
-    into: NDArray
-    near_start: NDArray
-    near_list: NDArray
+    at: NDArray[Any]
+    weight: NDArray[Any]
+    parts: NDArray[Any]
+    kind: NDArray[Any]
+    into: NDArray[Any]
+    near_start: NDArray[Any]
+    near_list: NDArray[Any]
 
 
 @compiled
-def _at_least(points: NDArray, x: int, at: NDArray, cells: NDArray, c: int) -> float:
+def _at_least(points: NDArray[Any], x: int, at: NDArray[Any], cells: NDArray[Any], c: int) -> float:
     """Squared distance of x to the box around cell c: cheap, and never more than that to the cell."""
     total = 0.0
     for k in range(3):
@@ -64,7 +64,7 @@ def _at_least(points: NDArray, x: int, at: NDArray, cells: NDArray, c: int) -> f
 
 @compiled
 def _closer(
-    points: NDArray, parts: NDArray, x: int, at: NDArray, cells: NDArray, cell_part: NDArray, c: int, best: float,
+    points: NDArray[Any], parts: NDArray[Any], x: int, at: NDArray[Any], cells: NDArray[Any], cell_part: NDArray[Any], c: int, best: float,
     radius: float,
 ) -> tuple[float, float]:  # fmt: skip
     """Squared distance of x to cell c and what lifting may cost there; inf unless closer than `best` and of its part.
@@ -93,8 +93,8 @@ def _closer(
 
 
 @compiled
-def _touches(cells: NDArray, c: int, v: int) -> bool:
-    return cells[c, 0] == v or cells[c, 1] == v or cells[c, 2] == v
+def _touches(cells: NDArray[Any], c: int, v: int) -> bool:
+    return bool(cells[c, 0] == v or cells[c, 1] == v or cells[c, 2] == v)
 
 
 @compiled
@@ -117,7 +117,7 @@ def _closest_around(x: int, avoid: int, finer: Finer, coarse: Coarse, radius: fl
 
 
 @compiled
-def _region(p: int, coarse: Coarse) -> NDArray:
+def _region(p: int, coarse: Coarse) -> NDArray[Any]:
     """The finer nodes that belong to p and its neighbours."""
     size = coarse.member_start[p + 1] - coarse.member_start[p]
     for j in range(coarse.near_start[p], coarse.near_start[p + 1]):
@@ -134,7 +134,7 @@ def _region(p: int, coarse: Coarse) -> NDArray:
 
 
 @compiled
-def _any_around(p: int, marked: NDArray, coarse: Coarse) -> bool:
+def _any_around(p: int, marked: NDArray[Any], coarse: Coarse) -> bool:
     """Whether p or a neighbour is marked."""
     if marked[p]:
         return True
@@ -145,7 +145,9 @@ def _any_around(p: int, marked: NDArray, coarse: Coarse) -> bool:
 
 
 @compiled
-def closest_cells_around(finer: Finer, coarse: Coarse, radius: float) -> tuple[NDArray, NDArray, NDArray]:
+def closest_cells_around(
+    finer: Finer, coarse: Coarse, radius: float
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """For each finer node the closest cell around its vertex, the squared distance to it and the cost of lifting."""
     cell, d2, cost = np.empty(len(finer.at), np.int64), np.empty(len(finer.at)), np.empty(len(finer.at))
     for x in range(len(finer.at)):
@@ -155,9 +157,9 @@ def closest_cells_around(finer: Finer, coarse: Coarse, radius: float) -> tuple[N
 
 @compiled
 def relocate(
-    finer: Finer, coarse: Coarse, chosen: NDArray, stirred: NDArray, radius: float,
-    cell: NDArray, d2: NDArray, cost: NDArray,
-) -> NDArray:  # fmt: skip
+    finer: Finer, coarse: Coarse, chosen: NDArray[Any], stirred: NDArray[Any], radius: float,
+    cell: NDArray[Any], d2: NDArray[Any], cost: NDArray[Any],
+) -> NDArray[Any]:  # fmt: skip
     """Move each coarse vertex to the finer node beside it that most lowers the summed squared lifting cost around it.
 
     chosen (k,): finer node of each coarse vertex; it, `coarse.at` and the three arrays of `closest_cells_around` are
@@ -214,9 +216,9 @@ def relocate(
 
 @compiled
 def flip_gains(
-    finer: Finer, coarse: Coarse, pairs: NDArray, corners: NDArray, stirred: NDArray, radius: float,
-    cell: NDArray, d2: NDArray, cost: NDArray,
-) -> NDArray:  # fmt: skip
+    finer: Finer, coarse: Coarse, pairs: NDArray[Any], corners: NDArray[Any], stirred: NDArray[Any], radius: float,
+    cell: NDArray[Any], d2: NDArray[Any], cost: NDArray[Any],
+) -> NDArray[Any]:  # fmt: skip
     """How much the summed squared lifting cost falls if the common edge of two triangles is turned, (q,).
 
     pairs (q, 2): the two cells; corners (q, 4) = a, b, c, d with the cells a b c and b a d, which become a d c and

@@ -36,7 +36,9 @@ class Cells:
     part: NDArray[np.int64]
 
 
-def coarse_cells(faces: NDArray, part: NDArray, edges: NDArray, parts: NDArray[np.uint64], n_parts: int) -> Cells:
+def coarse_cells(
+    faces: NDArray[Any], part: NDArray[Any], edges: NDArray[Any], parts: NDArray[np.uint64], n_parts: int
+) -> Cells:
     """Triangles of each part, then its edges on no triangle of it, then its nodes on neither.
 
     faces (m, 3), part (m,), edges (e, 2) and the rows of `parts` (n, words) in the coarse numbering.

@@ -15,14 +15,18 @@ def planes(
     """Quadrics (k, 10) of weight times squared distance to planes with unit `normal` (k, 3) `through` points (k, 3)."""
     x, y, z = normal.T
     w = -(normal * through).sum(axis=1)
-    return weight[:, None] * np.stack([x * x, x * y, x * z, x * w, y * y, y * z, y * w, z * z, z * w, w * w], axis=1)
+    return np.asarray(
+        weight[:, None] * np.stack([x * x, x * y, x * z, x * w, y * y, y * z, y * w, z * z, z * w, w * w], axis=1)
+    )
 
 
 def points(at: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
     """Quadrics (k, 10) of weight times squared distance to points (k, 3)."""
     x, y, z = at.T
     one, none = np.ones(len(at)), np.zeros(len(at))
-    return weight[:, None] * np.stack([one, none, none, -x, one, none, -y, one, -z, (at * at).sum(axis=1)], axis=1)
+    return np.asarray(
+        weight[:, None] * np.stack([one, none, none, -x, one, none, -y, one, -z, (at * at).sum(axis=1)], axis=1)
+    )
 
 
 def vertex_quadrics(

@@ -426,7 +426,7 @@ def _close_pairs(state: _State, distance: float) -> NDArray[np.int32]:
     keep = common & (same_place | (~beside & (apart <= reach)))
     pairs, apart, same_place = pairs[keep], apart[keep], same_place[keep]
     along = _contraction.graph_distances(pairs, apart * _DETOUR, state.at, graph.indptr, graph.indices)
-    return pairs[same_place | ((along > apart * (1 + 1e-9)) & np.isfinite(along))]
+    return np.asarray(pairs[same_place | ((along > apart * (1 + 1e-9)) & np.isfinite(along))])
 
 
 def _bits(words: NDArray[np.uint64]) -> NDArray[np.bool_]:

@@ -367,12 +367,12 @@ class _Target(Protocol):
     def group(self, name: str, attributes: dict[str, Any]) -> None: ...
 
     def array(
-        self, group: str, name: str, dims: tuple[str, ...], values: NDArray, attributes: dict[str, Any]
+        self, group: str, name: str, dims: tuple[str, ...], values: NDArray[Any], attributes: dict[str, Any]
     ) -> None: ...
 
     def stream(
         self, group: str, name: str, dims: tuple[str, ...], shape: tuple[int, ...], attributes: dict[str, Any]
-    ) -> Callable[[int, int, int, NDArray], None]:
+    ) -> Callable[[int, int, int, NDArray[Any]], None]:
         """A function that writes (run, first state, last state + 1, block)."""
         ...
 
@@ -386,7 +386,9 @@ class _ZarrTarget:
     def group(self, name: str, attributes: dict[str, Any]) -> None:
         self._root.require_group(name).attrs.update(attributes)
 
-    def array(self, group: str, name: str, dims: tuple[str, ...], values: NDArray, attributes: dict[str, Any]) -> None:
+    def array(
+        self, group: str, name: str, dims: tuple[str, ...], values: NDArray[Any], attributes: dict[str, Any]
+    ) -> None:
         array = self._root.require_group(group).create_array(
             name, data=np.ascontiguousarray(values), dimension_names=dims, compressors=codecs(),
             config={"write_empty_chunks": True}, chunk_key_encoding=KEYS,
@@ -395,14 +397,14 @@ class _ZarrTarget:
 
     def stream(
         self, group: str, name: str, dims: tuple[str, ...], shape: tuple[int, ...], attributes: dict[str, Any]
-    ) -> Callable[[int, int, int, NDArray], None]:
+    ) -> Callable[[int, int, int, NDArray[Any]], None]:
         array = self._root.require_group(group).create_array(
             name, shape=shape, chunks=(1, *shape[1:]), dtype="float32", fill_value=np.nan, dimension_names=dims,
             compressors=codecs(), config={"write_empty_chunks": True}, chunk_key_encoding=KEYS,
         )  # fmt: skip
         array.attrs.update(attributes)
 
-        def write(run: int, begin: int, end: int, block: NDArray) -> None:
+        def write(run: int, begin: int, end: int, block: NDArray[Any]) -> None:
             array[run, begin:end] = block
 
         return write
@@ -420,20 +422,31 @@ class _NetcdfTarget:
     def group(self, name: str, attributes: dict[str, Any]) -> None:
         self._root.createGroup(name).setncatts(attributes)
 
-    def array(self, group: str, name: str, dims: tuple[str, ...], values: NDArray, attributes: dict[str, Any]) -> None:
+    def array(
+        self, group: str, name: str, dims: tuple[str, ...], values: NDArray[Any], attributes: dict[str, Any]
+    ) -> None:
         self._variable(group, name, dims, values.shape, values.dtype, attributes)[...] = values
 
     def stream(
         self, group: str, name: str, dims: tuple[str, ...], shape: tuple[int, ...], attributes: dict[str, Any]
-    ) -> Callable[[int, int, int, NDArray], None]:
+    ) -> Callable[[int, int, int, NDArray[Any]], None]:
         variable = self._variable(group, name, dims, shape, np.dtype(np.float32), attributes, (1, *shape[1:]))
 
-        def write(run: int, begin: int, end: int, block: NDArray) -> None:
+        def write(run: int, begin: int, end: int, block: NDArray[Any]) -> None:
             variable[run, begin:end] = block
 
         return write
 
-    def _variable(self, group, name, dims, shape, dtype, attributes, chunks=None):  # type: ignore[no-untyped-def]
+    def _variable(
+        self,
+        group: str,
+        name: str,
+        dims: tuple[str, ...],
+        shape: tuple[int, ...],
+        dtype: np.dtype[Any],
+        attributes: dict[str, Any],
+        chunks: tuple[int, ...] | None = None,
+    ) -> Any:
         home = self._root.createGroup(group)
         for dim, size in zip(dims, shape, strict=True):
             if dim not in home.dimensions and dim not in self._root.dimensions:

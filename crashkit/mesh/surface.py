@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -133,7 +134,9 @@ def part_sets(n: int, triangles: NDArray[np.int32], part: NDArray[np.int32], n_p
     return sets
 
 
-def _triangulate(at: NDArray, corners: NDArray, part: NDArray) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def _triangulate(
+    at: NDArray[Any], corners: NDArray[Any], part: NDArray[Any]
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Quadrilaterals cut along the shorter diagonal, so that a bent one keeps its fold."""
     if corners.shape[1] == 3:
         return corners.astype(np.int32), part
@@ -154,7 +157,7 @@ def _triangulate(at: NDArray, corners: NDArray, part: NDArray) -> tuple[NDArray[
     return triangles, np.concatenate([part[three], part[quad], part[quad]]).astype(np.int32)
 
 
-def _without_useless(triangles: NDArray, part: NDArray) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def _without_useless(triangles: NDArray[Any], part: NDArray[Any]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Leave out triangles with a doubled corner, and all but the first of those with the same corners and part."""
     a, b, c = triangles.T
     keep = (a != b) & (b != c) & (a != c)
@@ -166,7 +169,7 @@ def _without_useless(triangles: NDArray, part: NDArray) -> tuple[NDArray[np.int3
     return triangles[first], part[first]
 
 
-def _with_extra(edges: NDArray[np.int32], extra: NDArray, used: NDArray[np.bool_]) -> NDArray[np.int32]:
+def _with_extra(edges: NDArray[np.int32], extra: NDArray[Any], used: NDArray[np.bool_]) -> NDArray[np.int32]:
     if extra.ndim != 2 or extra.shape[1] != 2:
         raise MeshError(f"extra edges have shape {extra.shape}; expected (edge, 2)")
     if len(extra) and (extra.min() < 0 or extra.max() >= len(used)):

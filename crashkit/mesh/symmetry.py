@@ -180,7 +180,7 @@ def _spread(mesh: Surface, normal: NDArray[np.float64], offset: float) -> float:
 
 def _some(mesh: Surface) -> NDArray[np.float64]:
     at = mesh.position[mesh.used]
-    return at[np.unique(np.linspace(0, len(at) - 1, _SEEN).astype(int))]
+    return np.asarray(at[np.unique(np.linspace(0, len(at) - 1, _SEEN).astype(int))])
 
 
 def _mirrored(at: NDArray[np.float64], normal: NDArray[np.float64], offset: float) -> NDArray[np.float64]:

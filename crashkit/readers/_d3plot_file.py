@@ -142,7 +142,7 @@ class D3plotFile:
                 f"{words['nel4']} shells, {words['nel8']} solids), the file has {size}; "
                 "it is cut short or damaged, copy it again"
             )
-        return need
+        return int(need)
 
     def _place_blocks(self) -> dict[str, tuple[int, int]]:
         """Name -> (first word, words) of the blocks of one state, in the order of LS-DYNA's database manual."""

@@ -34,7 +34,7 @@ def geometry_class() -> Any:
     from lasso.dyna import D3plot
     from lasso.io.binary_buffer import BinaryBuffer
 
-    class Geometry(D3plot):
+    class Geometry(D3plot):  # type: ignore[misc]
         def __init__(self, content: bytes) -> None:
             super().__init__()
             self._buffer = BinaryBuffer()

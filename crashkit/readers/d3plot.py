@@ -374,11 +374,11 @@ def _one_value(plain: str, values: NDArray[Any]) -> NDArray[Any]:
     if plain == "von_mises":
         xx, yy, zz, xy, yz, zx = np.moveaxis(values.astype(np.float64), -1, 0)
         squared = ((xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2) / 2 + 3 * (xy**2 + yz**2 + zx**2)
-        return np.sqrt(squared).max(axis=1)
+        return np.asarray(np.sqrt(squared).max(axis=1))
     if plain == "plastic_strain":
-        return values.max(axis=1)
+        return np.asarray(values.max(axis=1))
     if plain in ("stress", "strain", "strain_rate"):
-        return values.mean(axis=1, dtype=np.float64)
+        return np.asarray(values.mean(axis=1, dtype=np.float64))
     return values
 
 

@@ -256,7 +256,7 @@ class _Steps(GridSource):
         corners = np.cumsum([0, *(len(part.mesh[0]) for part in self._parts)])
         units = {
             name: unit for part in self._parts for kind in ("point", "cell") for name, unit in part.arrays(kind).items()
-        }  # type: ignore[arg-type]
+        }
         numbers = np.arange(1, len(self._parts) + 1)
         cell_data = {name: self.array("cell", name, 0) for name in self._names("cell")}
         names: dict[int, str] = {}

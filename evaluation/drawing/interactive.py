@@ -242,4 +242,4 @@ def _page(scene: bytes, run: Mapping[str, Any], title: str) -> str:
     if not body or "</title>" not in end or load not in rest:
         raise EvaluationError("the viewer of this trame-vtk is not the page expected: install trame-vtk 2.11")
     head = f"{start}<title>{escape(title)}{end[end.index('</title>') :]}"
-    return head + body + controls + rest.replace(load, load + " if (window.withoutView) return;", 1)
+    return str(head + body + controls + rest.replace(load, load + " if (window.withoutView) return;", 1))

@@ -308,7 +308,7 @@ def _sheet_of(rows: Sequence[Sequence[Panel]], scales: Sequence[Scale], sheet: S
 
 def _ratio(row: Sequence[Panel]) -> float:
     height, width = row[0].image.shape[:2]
-    return height / width
+    return float(height / width)
 
 
 def _share(box: tuple[float, float, float, float], width: float, height: float) -> tuple[float, float, float, float]:
@@ -324,7 +324,7 @@ def _bar(axes: Axes, scale: Scale, orientation: str, ticks: int = 5) -> None:
     low, high = scale.limits
     mappable = ScalarMappable(Normalize(low, high if high > low else low + 1e-12), scale.colours)
     bar = axes.figure.colorbar(mappable, cax=axes, orientation=orientation)
-    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar.outline.set_visible(False)
     bar.locator = MaxNLocator(ticks)
     bar.update_ticks()
     if orientation == "vertical":  # written across, above the bar: along it, it may be longer than the bar

@@ -84,7 +84,7 @@ def choose_view(
 
     def eye(side: int, turn: int) -> NDArray[np.float64]:
         level = np.cos(np.radians(30)) * side * y + np.sin(np.radians(30)) * turn * x
-        return np.cos(tilt) * level + np.sin(tilt) * z
+        return np.asarray(np.cos(tilt) * level + np.sin(tilt) * z)
 
     corners = [eye(side, turn) for side in (-1, 1) for turn in (-1, 1)]
     # Rounded, so that noise does not decide between the corners of a symmetric structure.
@@ -259,7 +259,7 @@ def _aim(camera: Any, view: View) -> None:
 def _averaged(image: NDArray[Any]) -> Image:
     height, width = (size // _SAMPLES for size in image.shape[:2])
     blocks = image[: height * _SAMPLES, : width * _SAMPLES].reshape(height, _SAMPLES, width, _SAMPLES, 3)
-    return np.round(blocks.mean(axis=(1, 3))).astype(np.uint8)
+    return np.asarray(np.round(blocks.mean(axis=(1, 3))).astype(np.uint8))
 
 
 # --- drawing without a display ---------------------------------------------------------------------------------

@@ -41,7 +41,7 @@ class ErrorOnLevels:
             for model in self.approximation for level, n in self.nodes.items()
         ]  # fmt: skip
         rows += [
-            (f"POD floor r={self.modes}", level, n, "own", None, self.floor.get(level, np.nan) * CM)  # type: ignore[misc]
+            (f"POD floor r={self.modes}", level, n, "own", None, self.floor.get(level, np.nan) * CM)
             for level, n in self.nodes.items()
         ]
         names = ("model", "level", "nodes", "prediction_is", "approximation_cm", "reconstruction_cm")

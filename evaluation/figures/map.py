@@ -66,7 +66,7 @@ class ErrorMap:
             ScalarMappable(Normalize(0, top), ERROR), ax=axes, orientation="horizontal", shrink=0.5, aspect=45, pad=0.02
         )
         bar.set_label("mean node error over test runs and time (cm)")
-        bar.outline.set_visible(False)  # type: ignore[operator]
+        bar.outline.set_visible(False)
         return figure
 
     def caption(self) -> str:

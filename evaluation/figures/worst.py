@@ -35,7 +35,7 @@ class WorstState:
     node_id: NDArray[np.integer]
 
     def _error(self) -> NDArray[np.float64]:
-        return np.linalg.norm(self.prediction - self.truth, axis=-1).astype(np.float64)
+        return np.asarray(np.linalg.norm(self.prediction - self.truth, axis=-1).astype(np.float64))
 
     def numbers(self) -> Columns:
         error = self._error()

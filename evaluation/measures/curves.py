@@ -61,7 +61,7 @@ def curves(time: NDArray[np.float64], displacement: NDArray[np.floating]) -> Cur
 
     def resultant(values: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
         filtered = values if cfc is None else cfc_filter(at, values, cfc)
-        return np.linalg.norm(filtered, axis=-1)
+        return np.asarray(np.linalg.norm(filtered, axis=-1))
 
     inner = slice(_ENDS, len(time) - _ENDS)
     enough = cfc is not None and len(time) >= 2 * _ENDS + 4

@@ -46,7 +46,7 @@ def node_distance(truth: NDArray[np.floating], prediction: NDArray[np.floating])
 
 def gone(truth: NDArray[np.floating]) -> NDArray[np.bool_]:
     """(state, node): whether the node has no displacement any more, since all its elements have failed."""
-    return ~np.isfinite(truth).all(axis=-1)
+    return np.asarray(~np.isfinite(truth).all(axis=-1))
 
 
 def mean_node_error(distance: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -59,7 +59,7 @@ def masked_mean(values: NDArray[np.floating], axis: int | tuple[int, ...] | None
     there = ~np.isnan(values)
     count = there.sum(axis=axis)
     total = np.where(there, values, 0).sum(axis=axis, dtype=np.float64)
-    return np.divide(total, count, out=np.full(np.shape(total), np.nan), where=count > 0)
+    return np.asarray(np.divide(total, count, out=np.full(np.shape(total), np.nan), where=count > 0))
 
 
 def quantile_node_error(distance: NDArray[np.float64], q: float) -> NDArray[np.float64]:

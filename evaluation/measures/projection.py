@@ -21,7 +21,7 @@ def last_seen(displacement: NDArray[np.floating]) -> NDArray[np.floating]:
     if not missing.any():
         return displacement
     last = np.maximum.accumulate(np.where(missing, 0, np.arange(len(displacement))[:, None]), axis=0)
-    return np.nan_to_num(np.take_along_axis(displacement, last[..., None], axis=0))
+    return np.asarray(np.nan_to_num(np.take_along_axis(displacement, last[..., None], axis=0)))
 
 
 def moving(pod: Pod) -> Pod:

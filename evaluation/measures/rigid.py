@@ -44,12 +44,12 @@ class RigidMotion:
     def displacement(self, position: ArrayLike) -> Floats:
         """Displacements (t, n, 3), m, of nodes at `position` (n, 3), m, if they only moved with the body."""
         arm = np.asarray(position, np.float64) - self.centre
-        return np.einsum("tij,nj->tni", self.rotation, arm) + self.translation[:, None] - arm
+        return np.asarray(np.einsum("tij,nj->tni", self.rotation, arm) + self.translation[:, None] - arm)
 
     def deformation(self, position: ArrayLike, displacement: ArrayLike) -> Floats:
         """What is left of `displacement` (t, n, 3), m, seen by somebody who moves with the body: d, (t, n, 3), m."""
         rest = np.asarray(displacement, np.float64) - self.displacement(position)
-        return np.einsum("tji,tnj->tni", self.rotation, rest)
+        return np.asarray(np.einsum("tji,tnj->tni", self.rotation, rest))
 
     @property
     def angle(self) -> Floats:
@@ -90,7 +90,7 @@ def _rotation(before: Floats, after: Floats) -> Floats:
     """The proper rotation R (3, 3) with the least sum of squares of after - R before."""
     left, _, right = np.linalg.svd(after.T @ before)
     sign = np.array([1.0, 1.0, np.linalg.det(left) * np.linalg.det(right)])
-    return (left * np.sign(sign)) @ right
+    return np.asarray((left * np.sign(sign)) @ right)
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ def _angle(rotation: Floats) -> Floats:
         axis=-1,
     )
     twice_cosine = np.trace(rotation, axis1=1, axis2=2) - 1
-    return np.degrees(np.arctan2(np.linalg.norm(twice_sine, axis=-1), twice_cosine))
+    return np.asarray(np.degrees(np.arctan2(np.linalg.norm(twice_sine, axis=-1), twice_cosine)))
 
 
 def _checked(position: ArrayLike, displacement: ArrayLike) -> tuple[Floats, NDArray[np.floating]]:

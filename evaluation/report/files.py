@@ -190,7 +190,7 @@ def _about(reference: Reference, run: int) -> dict[str, Any]:
 
 
 def _distance(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float32]:
-    return np.linalg.norm(a - b, axis=-1).astype(np.float32)
+    return np.asarray(np.linalg.norm(a - b, axis=-1).astype(np.float32))
 
 
 def _size(points: NDArray[np.float64]) -> float:

@@ -56,7 +56,7 @@ class Posterior:
         seen, solve = self._seen()
         k = self.kernel(x, seen)
         own = _diagonal(self.kernel, x)
-        return np.maximum(own - (k * solve(k.T).T).sum(axis=1), 0.0)
+        return np.asarray(np.maximum(own - (k * solve(k.T).T).sum(axis=1), 0.0))
 
     def reductions(
         self, candidates: NDArray[np.float64], over: NDArray[np.float64], weights: NDArray[np.float64]

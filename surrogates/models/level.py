@@ -113,7 +113,8 @@ class LevelNetwork(nn.Module):
         """Up(dec_l(z)): what the coarser level makes of z, on this level's nodes."""
         if self.coarse is None or self.upsampling is None:
             raise SurrogateError("the coarsest level has nothing below it")
-        return self.upsampling(self.coarse.decode(z[:, : self.coarse.latent]) * self.ratio)
+        result: Tensor = self.upsampling(self.coarse.decode(z[:, : self.coarse.latent]) * self.ratio)
+        return result
 
     def regress(self, inputs: Tensor, known: Known | None = None, initial: Tensor | None = None) -> Tensor:
         """(b, inputs) -> z (b, latent); `initial` (node, b or 1, 3) are the first states, zero if not given."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -78,7 +78,7 @@ class PodRegression:
         return (0,)
 
     def latent(self, number: int) -> int:
-        return self.modes.shape[1]
+        return int(self.modes.shape[1])
 
     def coefficients(self, parameters: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float64]:
         """(run, p) and (state,), s -> (run, state, mode), m. Between trained times the course is interpolated."""
@@ -122,7 +122,7 @@ class PodRegression:
         return self.modes.size + self.data.values.size + kernel
 
     def tensors(self) -> dict[str, dict[str, Tensor]]:
-        arrays: dict[str, NDArray] = {
+        arrays: dict[str, NDArray[Any]] = {
             "modes": self.modes, "parameters": self.data.parameters, "time": self.data.time,
             "values": self.data.values, "low": self.low, "high": self.high, **self.machine.numbers(),
         }  # fmt: skip
@@ -339,7 +339,7 @@ def _points(data: Coefficients) -> NDArray[np.float64]:
 
 def _scaled_time(time: NDArray[np.float64], trained: NDArray[np.float64]) -> NDArray[np.float64]:
     span = trained[-1] - trained[0]
-    return 2 * (time - trained[0]) / (span if span > 0 else 1.0) - 1
+    return np.asarray(2 * (time - trained[0]) / (span if span > 0 else 1.0) - 1)
 
 
 def _at(course: NDArray[np.float64], trained: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -351,7 +351,7 @@ def _at(course: NDArray[np.float64], trained: NDArray[np.float64], time: NDArray
         return course[:, places]
     from scipy.interpolate import PchipInterpolator
 
-    return PchipInterpolator(trained, course, axis=1)(np.clip(time, trained[0], trained[-1]))
+    return np.asarray(PchipInterpolator(trained, course, axis=1)(np.clip(time, trained[0], trained[-1])))
 
 
 def _pieces(points: NDArray[np.float64], size: int = 2048) -> Iterable[NDArray[np.float64]]:

@@ -92,7 +92,8 @@ class Unified(Network):
         if self.with_initial:
             first = self.encode(inputs.new_zeros(self.n_nodes, 1, 3) if initial is None else initial)
             inputs = torch.cat([inputs, first.expand(len(inputs), -1) if len(first) == 1 else first], dim=1)
-        return self.regressor(inputs)
+        result: Tensor = self.regressor(inputs)
+        return result
 
     def restrict(self, x: Tensor, number: int) -> Tensor:
         """D x from the finest level to `number`."""

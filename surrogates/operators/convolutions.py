@@ -25,7 +25,7 @@ from torch.nn import functional
 
 from surrogates.errors import SurrogateError
 from surrogates.operators.chebyshev import of_powers, of_terms
-from surrogates.operators.graph import GraphOperator, check_state
+from surrogates.operators.graph import GraphOperator, applied, check_state
 
 
 def _powers(operator: GraphOperator, powers: Tensor) -> Tensor:
@@ -115,7 +115,8 @@ def _plain_cheb(x: Tensor, weight: Tensor, bias: Tensor | None, operator: GraphO
 
 def _mix(x: Tensor, weight: Tensor) -> Tensor:
     """The channels of x (in, n, b) mixed by weight (in, out): -> (out, n, b)."""
-    return torch.tensordot(weight.t(), x, dims=1)
+    result: Tensor = torch.tensordot(weight.t(), x, dims=1)
+    return result
 
 
 class ChebConv(nn.Module):
@@ -161,7 +162,7 @@ class ChebConv(nn.Module):
             out = _plain_cheb(inside, self.weight, self.bias, self.operator)
             out = functional.elu(out) if self.elu else out
         else:
-            out = _Cheb.apply(inside, self.weight, self.bias, self.operator, self.elu)
+            out = applied(_Cheb, inside, self.weight, self.bias, self.operator, self.elu)
         return out.permute(1, 2, 0)
 
     def extra_repr(self) -> str:

@@ -84,7 +84,7 @@ class GraphOperator:
 
     def propagate(self, x: Tensor) -> Tensor:
         """The operator times every channel: (channel, n, batch) -> same. Differentiable any number of times."""
-        return self.times(x) if self.is_dense(x.device) else _Propagate.apply(x, self)
+        return self.times(x) if self.is_dense(x.device) else applied(_Propagate, x, self)
 
     def times(self, x: Tensor, out: Tensor | None = None, *, add: bool = False) -> Tensor:
         """`propagate` without a gradient of its own; into `out`, and added to what stands there if `add`."""
@@ -186,11 +186,17 @@ class _Propagate(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
-        return _Propagate.apply(gradients[0], ctx.operator), None
+        return applied(_Propagate, gradients[0], ctx.operator), None
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Tensor:
-        return _Propagate.apply(tangents[0], ctx.operator)
+        return applied(_Propagate, tangents[0], ctx.operator)
+
+
+def applied(function: type[torch.autograd.Function], *values: Any) -> Tensor:
+    """What the autograd function makes of `values`; torch gives its `apply` no types."""
+    out: Tensor = function.apply(*values)
+    return out
 
 
 def check_state(x: Tensor, operator: GraphOperator, channels: int) -> None:

@@ -24,7 +24,7 @@ from torch.nn import functional
 
 from surrogates.errors import SurrogateError
 from surrogates.operators.convolutions import ChebConv, GCN2Conv, GCNConv
-from surrogates.operators.graph import GraphOperator
+from surrogates.operators.graph import GraphOperator, applied
 
 
 class _Encode(torch.autograd.Function):
@@ -99,7 +99,8 @@ class Convolutions(nn.Module):
         x0 = x
         for layer in self.layers:
             x = layer(x, x0) if isinstance(layer, GCN2Conv) else layer(x)
-        return self.after(x)
+        result: Tensor = self.after(x)
+        return result
 
 
 class GraphEncoder(nn.Module):
@@ -122,7 +123,7 @@ class GraphEncoder(nn.Module):
         if operator.form == "dense":
             return functional.linear(h.transpose(0, 1).flatten(1), self.dense.weight, self.dense.bias)
         weight = self.dense.weight.unflatten(1, (operator.n_nodes, -1)).transpose(1, 2).flatten(1)
-        return _Encode.apply(h.permute(2, 0, 1).reshape(-1, h.shape[1]), weight, self.dense.bias)
+        return applied(_Encode, h.permute(2, 0, 1).reshape(-1, h.shape[1]), weight, self.dense.bias)
 
 
 class GraphDecoder(nn.Module):
@@ -145,10 +146,11 @@ class GraphDecoder(nn.Module):
         operator, (weight, bias) = self.convolutions.operator, (self.dense.weight, self.dense.bias)
         if operator.form == "dense":
             h = functional.elu(functional.linear(z, weight, bias))
-            return self.convolutions(h.unflatten(1, (self.n_nodes, self.channels)).transpose(0, 1))
+            states: Tensor = self.convolutions(h.unflatten(1, (self.n_nodes, self.channels)).transpose(0, 1))
+            return states
         weight = weight.unflatten(0, (self.n_nodes, self.channels)).transpose(0, 1).flatten(0, 1)
         bias = bias.unflatten(0, (self.n_nodes, self.channels)).t().flatten()
-        h = _Decode.apply(z, weight, bias)
-        x = self.convolutions(h.reshape(self.channels, self.n_nodes, -1).permute(1, 2, 0))
+        h = applied(_Decode, z, weight, bias)
+        x: Tensor = self.convolutions(h.reshape(self.channels, self.n_nodes, -1).permute(1, 2, 0))
         # Gradients want the memory channel by channel; in a prediction, node by node, what follows moves whole rows.
         return x if torch.is_grad_enabled() else x.transpose(1, 2).contiguous().transpose(1, 2)

@@ -84,8 +84,12 @@ class Clock:
         return np.asarray(self.start + np.linspace(first, span, max(count, 1) + 1))
 
     def apply(
-        self, states: NDArray, parameters: NDArray[np.float64], time: NDArray[np.float64], grid: NDArray[np.float64]
-    ) -> NDArray:
+        self,
+        states: NDArray[Any],
+        parameters: NDArray[np.float64],
+        time: NDArray[np.float64],
+        grid: NDArray[np.float64],
+    ) -> NDArray[Any]:
         """A run's states (state, ..) at `time` as those of the reference at `grid`; the last slope goes on at the end.
 
         Parameters
@@ -96,7 +100,9 @@ class Clock:
         if self.speed is None:
             return states
         rate, size = float(self.rate(parameters[None])[0]), float(self.size(parameters[None])[0])
-        return between(states, time, self.start + (grid - self.start) / rate) / np.asarray(size, states.dtype)
+        return np.asarray(
+            between(states, time, self.start + (grid - self.start) / rate) / np.asarray(size, states.dtype)
+        )
 
     def times(self, parameters: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float64]:
         """Reference times of the times (state,) of a run with parameters (parameter,)."""
@@ -139,7 +145,7 @@ class Clock:
         )
 
 
-def between(states: NDArray, time: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray:
+def between(states: NDArray[Any], time: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[Any]:
     """States (state, ..) at `time`, linear between them and along the last piece beyond, at times `wanted`."""
     if len(time) == 1:
         return np.repeat(states, len(wanted), axis=0)

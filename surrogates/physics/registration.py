@@ -98,10 +98,10 @@ class Registration:
 
     def undo(
         self,
-        model: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray],
+        model: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[Any]],
         parameters: NDArray[np.float64],
         time: NDArray[np.float64],
-    ) -> NDArray:
+    ) -> NDArray[Any]:
         """What the `model` behind it, (run, input) and (state,) -> (run, state, ..), says of runs at their own times.
 
         Parameters

@@ -254,7 +254,7 @@ class Trials:
         c = self.courses
         rows = c.modes.reshape(-1, 3, c.modes.shape[1])[c.nodes].reshape(-1, c.modes.shape[1])
         said = (coefficients[:, c.states] @ rows.T).reshape(c.truth[held].shape)
-        return np.linalg.norm(said - c.truth[held], axis=-1).mean(axis=(1, 2))
+        return np.asarray(np.linalg.norm(said - c.truth[held], axis=-1).mean(axis=(1, 2)))
 
 
 Machine = Gaussian | RadialBasis

@@ -67,11 +67,13 @@ class GraphReduction(Reduction):
 
     def encode(self, x: Tensor) -> Tensor:
         with _full_precision(x):
-            return self.encoder(x.float())
+            result: Tensor = self.encoder(x.float())
+            return result
 
     def decode(self, z: Tensor) -> Tensor:
         with _full_precision(z):
-            return self.decoder(z.float())
+            result: Tensor = self.decoder(z.float())
+            return result
 
     def end_at_zero(self) -> None:
         """Both ends at zero: what stands beside this reduction is all there is, until training moves it."""
@@ -93,7 +95,8 @@ class DenseReduction(Reduction):
         self.decoder = fully_connected((decoded, *hidden[::-1], 3 * n_nodes))
 
     def encode(self, x: Tensor) -> Tensor:
-        return self.encoder(flat(x))
+        result: Tensor = self.encoder(flat(x))
+        return result
 
     def decode(self, z: Tensor) -> Tensor:
         return unflat(self.decoder(z), self.n_nodes)

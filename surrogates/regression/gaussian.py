@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,7 +124,7 @@ class Gaussian:
         solved, ones = self._solved(x)
         gain = (self.kernel(np.atleast_2d(x), self.x) * solved).sum(axis=1)
         unknown = (1 - solved.sum(axis=1)) ** 2 / ones.sum()
-        return np.sqrt(np.maximum(self.kernel.at(x) - gain + unknown, 0) + self.kernel.noise)
+        return np.asarray(np.sqrt(np.maximum(self.kernel.at(x) - gain + unknown, 0) + self.kernel.noise))
 
     def _solved(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(query, sample): K^-1 k of each query, and (sample,): K^-1 1."""
@@ -137,7 +138,8 @@ class Gaussian:
         from scipy.linalg import cho_factor
 
         noise = self.kernel.noise + _JITTER
-        return cho_factor(self.kernel(self.x, self.x) + noise * np.eye(len(self.x)), lower=True)
+        factor, lower = cho_factor(self.kernel(self.x, self.x) + noise * np.eye(len(self.x)), lower=True)
+        return np.asarray(factor), bool(lower)
 
     @property
     def _informed(self) -> bool:
@@ -149,7 +151,7 @@ class Gaussian:
         return {"kernel": self.kernel.numbers, "mix": self.kernel.mix}
 
     @classmethod
-    def load(cls, x: NDArray[np.float64], arrays: Mapping[str, NDArray]) -> Gaussian:
+    def load(cls, x: NDArray[np.float64], arrays: Mapping[str, NDArray[Any]]) -> Gaussian:
         """From what `numbers` gave."""
         variance, slope, noise = (float(v) for v in arrays["kernel"])
         return cls(x, Kernel(variance, slope, noise, np.asarray(arrays["mix"], np.float64)))
@@ -173,7 +175,7 @@ class RadialBasis:
         kernel = "thin_plate_spline" if degree else "linear"
         try:
             machine = RBFInterpolator(self.x, np.eye(len(self.x)), kernel=kernel, degree=degree, smoothing=1e-9)
-            return machine(x)
+            return np.asarray(machine(x))
         except np.linalg.LinAlgError as error:
             raise SurrogateError(
                 "radial basis functions need parameters that do not lie on a line or plane; use model pod-gpr"
@@ -259,4 +261,4 @@ def _unlikely(
 
 def _squares(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """(a, b): squared distances."""
-    return np.maximum(np.square(a).sum(axis=1)[:, None] + np.square(b).sum(axis=1) - 2 * a @ b.T, 0.0)
+    return np.asarray(np.maximum(np.square(a).sum(axis=1)[:, None] + np.square(b).sum(axis=1) - 2 * a @ b.T, 0.0))

@@ -46,8 +46,9 @@ class Regressor(nn.Module):
 
     def forward(self, inputs: Tensor, coarse: Tensor | None = None) -> Tensor:
         if coarse is None:
-            return self.network(inputs)
-        out = self.network(torch.cat([inputs, coarse], dim=1))
+            alone: Tensor = self.network(inputs)
+            return alone
+        out: Tensor = self.network(torch.cat([inputs, coarse], dim=1))
         if not self.residual:
             return out
         return out + nn.functional.pad(coarse, (0, out.shape[1] - coarse.shape[1]))

@@ -40,7 +40,8 @@ class LevelProgram(nn.Module):
 
     def forward(self, parameters: Tensor, time: Tensor) -> Tensor:
         states = self.network(parameters, time, self.number)
-        return (states if self.lift is None else self.lift(states)).transpose(0, 1)
+        result: Tensor = (states if self.lift is None else self.lift(states)).transpose(0, 1)
+        return result
 
 
 def export(surrogate: Surrogate, path: str | Path, level: int | None = None, *, full: bool = False) -> float:
@@ -101,7 +102,7 @@ def _write_onnx(
         external_data=False, verbose=False,
     )  # fmt: skip
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    return session.run(None, {"parameters": parameters, "time": time})[0]
+    return np.asarray(session.run(None, {"parameters": parameters, "time": time})[0])
 
 
 def _write_program(
@@ -109,7 +110,7 @@ def _write_program(
 ) -> np.ndarray:
     torch.export.save(exported, path)
     program = torch.export.load(path).module()
-    return program(torch.from_numpy(parameters), torch.from_numpy(time)).detach().numpy()
+    return np.asarray(program(torch.from_numpy(parameters), torch.from_numpy(time)).detach().numpy())
 
 
 def _probes(surrogate: Surrogate, count: int) -> tuple[np.ndarray, np.ndarray]:

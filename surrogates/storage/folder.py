@@ -196,7 +196,7 @@ def _scale(core: Network | PodRegression, number: int) -> float:
 
 def _graph_tensors(surrogate: Surrogate) -> dict[str, Tensor]:
     graphs = surrogate.graphs
-    arrays: dict[str, NDArray] = {"nodes": np.array([graphs.n_full])}
+    arrays: dict[str, NDArray[Any]] = {"nodes": np.array([graphs.n_full])}
     if surrogate.points is not None and surrogate.faces is not None:
         arrays |= {"points": np.asarray(surrogate.points, np.float64), "faces": np.asarray(surrogate.faces, np.int32)}
     if surrogate.labels is not None:

@@ -226,7 +226,8 @@ class _Step:
         if self.clip:
             nn.utils.clip_grad_norm_(self.parameters, self.clip)
         self.optimiser.step()
-        return losses.detach()
+        result: Tensor = losses.detach()
+        return result
 
 
 def _optimiser(objective: Objective, settings: LevelSettings, device: torch.device) -> torch.optim.Optimizer:

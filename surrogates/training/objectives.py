@@ -99,7 +99,8 @@ class LevelObjective(Objective):
         x, inputs, known, initial = samples.batch(index)
         z = torch.cat([self.level.regress(inputs, known, initial), self.level.encode(x, known)])
         difference = self.level.decode(z).unflatten(1, (2, len(index))) - x[:, None]
-        return difference.square().mean(dim=(0, 2, 3)).float()
+        result: Tensor = difference.square().mean(dim=(0, 2, 3)).float()
+        return result
 
 
 class LatentObjective(Objective):
@@ -186,5 +187,4 @@ class UnifiedObjective(Objective):
 def _averaged(losses: Callable[[Samples, Tensor], Tensor], samples: Samples | None) -> Tensor | None:
     if samples is None or not len(samples):
         return None
-    total = sum(losses(samples, index) * len(index) for index in samples.chunks())
-    return total / len(samples)  # type: ignore[operator,return-value]
+    return torch.stack([losses(samples, index) * len(index) for index in samples.chunks()]).sum(dim=0) / len(samples)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from data_schema.pod import pod
+from surrogates.errors import SurrogateError
 from surrogates.models.level import LevelNetwork
 from surrogates.models.unified import Unified
 from surrogates.reductions.reduction import LinearReduction, LinearStart, flat
@@ -106,7 +107,10 @@ def _regress(linear: LinearReduction, pairs: Iterable[tuple[Tensor, Tensor]]) ->
 
 def _interpolated(level: LevelNetwork, x: Tensor) -> Tensor:
     """U D x: what interpolation between the coarse nodes already gives."""
-    return level.upsampling(x[level.in_finer])  # type: ignore[misc]
+    if level.upsampling is None:
+        raise SurrogateError("the coarsest level has nothing below it")
+    lifted: Tensor = level.upsampling(x[level.in_finer])
+    return lifted
 
 
 def _back(level: LevelNetwork, matrix: Tensor) -> Tensor:

@@ -236,4 +236,4 @@ def _predicted(surrogate: Surrogate, campaign: Campaign, run: int, number: int) 
 
 def _distance(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
     """(state, node)"""
-    return np.linalg.norm(a - b, axis=-1)
+    return np.asarray(np.linalg.norm(a - b, axis=-1))

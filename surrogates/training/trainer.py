@@ -170,7 +170,8 @@ class Trainer:
         count = len(self.campaign.time)
         at = torch.from_numpy(np.repeat(self.campaign.parameters[runs].astype(np.float64), count, axis=0))
         time = torch.from_numpy(np.tile(self.campaign.time.astype(np.float64), len(runs)))
-        return scaling(at, time).to(self.device)
+        result: Tensor = scaling(at, time).to(self.device)
+        return result
 
 
 def _divide_by_rms(states: Tensor, held: Tensor) -> float:
