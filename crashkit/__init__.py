@@ -10,6 +10,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from crashkit.register import register_accessor
+from crashkit.siblings import know_siblings
 from crashkit.version import __version__ as __version__
 
 if TYPE_CHECKING:
@@ -78,4 +79,5 @@ def __dir__() -> list[str]:
     return sorted(__all__)
 
 
+know_siblings()
 register_accessor()

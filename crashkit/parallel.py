@@ -6,6 +6,7 @@ Nothing depends on who does the work: a job gets an item and what all jobs share
 from __future__ import annotations
 
 import contextlib
+import importlib
 import logging
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -116,4 +117,6 @@ def _client(workers: int, scheduler: str | None, patience: float) -> Iterator[An
                 f"{scheduler}: no Dask scheduler answers there ({error}); start one with `dask scheduler`, or take workers of "
                 "this machine"
             ) from error
+        # A worker in the user's folder must know crashkit before it meets a class of our other packages.
+        client.run(importlib.import_module, "crashkit")
         yield client

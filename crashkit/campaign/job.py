@@ -18,6 +18,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from crashkit import siblings
+
 LOG, ORDER, END = "run.log", "job.json", "exit.json"
 
 
@@ -56,8 +58,8 @@ def last_lines(folder: Path, count: int = 3) -> str:
 
 
 def start_command(folder: Path) -> list[str]:
-    """The command line that does the job in `folder`; -P keeps files in the working folder from being imported."""
-    return [sys.executable, "-P", "-m", "crashkit.campaign.job", str(folder)]
+    """The command line that does the job in `folder`."""
+    return siblings.command("crashkit.campaign.job", str(folder))
 
 
 def run(folder: Path) -> Ended:

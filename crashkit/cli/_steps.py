@@ -8,11 +8,11 @@ import json
 import os
 import shlex
 import subprocess
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from crashkit import siblings
 from crashkit.cli._console import fail, say
 from crashkit.errors import OutputError
 from crashkit.version import __version__
@@ -140,12 +140,8 @@ def _note(done_file: Path, noted: dict[str, str], name: str, mark: str) -> None:
 
 def _run(number: int, arguments: Sequence[str]) -> None:
     """Run a command in a process of its own. Ctrl-C reaches it, too, and it is given the time to keep what it has."""
-    home = str(Path(__file__).parents[2])
-    path = os.pathsep.join(filter(None, [home, os.environ.get("PYTHONPATH", "")]))
-    # -P: a file of the user's folder called evaluation.py or surrogates.py is not taken for a package of ours.
-    command = [sys.executable, "-P", "-m", "crashkit", *arguments]
     interrupted = False
-    with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": path}) as process:
+    with subprocess.Popen(siblings.command("crashkit", *arguments), env=siblings.environment()) as process:
         while True:
             try:
                 code = process.wait()
