@@ -38,9 +38,10 @@ from surrogates.settings import Settings
 
 _log = logging.getLogger(__name__)
 
-# A change is kept if it lowers the error by this share; the whole is if it does by the larger one.
+# A change is kept if it lowers the error by this share. The whole is kept if it does by the larger one, and by so many
+# standard errors of the mean over runs: with few runs the best of forty trials is better by chance alone.
 _WORTH_A_CHANGE = 0.003
-_WORTH_IT_ALL = 0.01
+_WORTH_IT_ALL, _SURE = 0.01, 1.65
 _ROUNDS = 2
 # Sets of inputs that get to the folds in each round.
 _FINALISTS = 3
@@ -117,6 +118,16 @@ class _Search:
             if error < limit:
                 chosen, limit = way, error
         return chosen
+
+    def clearly_better(self, way: _Way, other: _Way) -> bool:
+        """Whether the error is lower beyond what the runs that happen to be there would explain."""
+        errors = [self.trials.errors(self.registration(w), w.plane or 0) for w in (way, other)]
+        judged = np.isfinite(errors[0]) & np.isfinite(errors[1])
+        gain = (errors[1] - errors[0])[judged]
+        if len(gain) < 2:
+            return bool(gain.sum() > 0)
+        needed = max(_WORTH_IT_ALL * errors[1][judged].mean(), _SURE * gain.std(ddof=1) / np.sqrt(len(gain)))
+        return bool(gain.mean() > needed)
 
     def starts(self) -> list[_Way]:
         """Everything at once, for each parity that parameters may have, and without images."""
@@ -231,7 +242,8 @@ def choose(
         way = search.improved_symmetry(way)
         if way == before:
             break
-    way = search.best([identity, way], margin=_WORTH_IT_ALL)
+    if not search.clearly_better(way, identity):
+        way = identity
     worth.errors = _worth(search, identity, way)
     worth.tried = len(search.tried)
     return search.registration(way), way.plane or 0, worth

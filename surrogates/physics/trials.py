@@ -38,7 +38,7 @@ _LIKELIHOOD_STATES = 21
 # Up to so many runs each is left out in turn.
 _LEAVE_ONE = 12
 # How often they are parted anew, by the largest number of runs.
-_ROUNDS = ((32, 3), (64, 2), (1 << 62, 1))
+_ROUNDS = ((32, 2), (1 << 62, 1))
 
 
 @dataclass(frozen=True)
