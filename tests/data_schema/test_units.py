@@ -135,6 +135,7 @@ def test_a_system_keeps_its_name_and_the_si_values_of_its_units(name: str) -> No
         ("ton", 1e3, "kg"), ("lbm", 0.45359237, "kg"), ("kp", 9.80665, "N"), ("kmh", 1 / 3.6, "m s-1"), ("KM/H", 1 / 3.6, "m s-1"),
         ("G", 9.80665, "m s-2"), ("g", 1e-3, "kg"), ("ft", 0.3048, "m"), ("sek", 1.0, "s"), ("GRAD", 1.0, "degree"),
         ("MM", 1e-3, "m"), ("gpa", 1e9, "Pa"), ("N/mm", 1e3, "N m-1"), ("kg/m^3", 1.0, "kg m-3"), ("percent", 1.0, "%"),
+        ("ton/mm^3", 1e12, "kg m-3"), ("km/std", 1 / 3.6, "m s-1"),
     ],
 )  # fmt: skip
 def test_units_of_mechanics_as_engineers_write_them(unit: str, factor: float, label: str) -> None:

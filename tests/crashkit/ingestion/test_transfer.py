@@ -167,6 +167,7 @@ def test_a_large_run_goes_through_a_file_with_the_same_result(
     large = desk.send(run, time, fields=("strain",))
     assert {name: desk.array(name).tobytes() for name in desk.names()} == {n: a.tobytes() for n, a in expected.items()}
     assert (large.digests, large.error) == (small.digests, small.error)
+    assert (large.displacement, large.speed) == (small.displacement, small.speed)
     assert run.read_states == [(0, 2), (2, 4), (4, 5)], "every state once, as many at a time as the budget allows"
     assert desk.left() == {"KEY"}
 
@@ -233,6 +234,24 @@ def test_garbage_on_nodes_that_are_gone_is_no_reason_to_refuse_but_on_others_is(
     desk.send(run)
     run.moved[2, 12] = np.inf  # one state before its element dies
     with pytest.raises(DataError, match=r"state 2 .*node 112"):
+        desk.send(run)
+
+
+@pytest.mark.parametrize(
+    ("before", "then", "refused"), [(0.1, 900.0, False), (0.1, 1100.0, True), (2.0, 1900.0, False), (2.0, 2100.0, True)]
+)
+def test_a_displacement_may_reach_a_thousand_times_the_structure_or_the_displacements_before(
+    desk: Desk, before: float, then: float, refused: bool
+) -> None:
+    """In diagonals of the plate, 40 mm by 20 mm."""
+    run = MemoryRun(speed=0.0)
+    run.moved[:] = 0.0
+    run.moved[2:, 5, 0] = before * np.hypot(40.0, 20.0)
+    run.moved[3:, 5, 0] = then * np.hypot(40.0, 20.0)
+    if not refused:
+        assert desk.send(run).displacement == pytest.approx(then * np.hypot(0.04, 0.02))
+        return
+    with pytest.raises(DataError, match=r"state 3 \(time 0\.003 s\), node 105: the displacement is .* m long"):
         desk.send(run)
 
 
