@@ -1,7 +1,7 @@
 """Proposals among runs that are computed already: error against the number of runs, for several ways to choose them.
 
     python benchmarks/replay.py crash.zarr --judged 96:128 [--pool 0:96,128:256] [--starts 10] [--first 16] [--batch 8]
-                                [--counts 24 48] [--odd pole_offset] [--folds] [--local] [--json FILE]
+                                [--counts 24 48] [--odd pole_offset] [--folds] [--local] [--every 1] [--json FILE]
 
 Each start draws `--first` runs of the pool at random. Then `--batch` runs at a time are asked for among the rest of the pool
 by the expected reduction of the error over the box (`surrogates.design.criteria`), with everything chosen anew by folds
@@ -39,6 +39,7 @@ def main() -> None:
     parser.add_argument("--judged", default="", help="runs that nobody chooses")
     parser.add_argument("--pool", default="", help="runs to choose among, ranges with commas; default: all others")
     parser.add_argument("--folds", action="store_true", help="judge each start on a quarter of the pool")
+    parser.add_argument("--every", type=int, default=1, help="take every so many states")
     parser.add_argument("--starts", type=int, default=10)
     parser.add_argument("--first", type=int, default=16)
     parser.add_argument("--batch", type=int, default=8)
@@ -50,7 +51,8 @@ def main() -> None:
 
     whole = open_campaign(args.dataset, symmetry=True)
     memory = np.stack([np.asarray(whole.displacement(0)[k]) for k in range(len(whole.parameters))])
-    whole = replace(whole, displacement=lambda level: memory)
+    memory = np.ascontiguousarray(memory[:, :: args.every])
+    whole = replace(whole, displacement=lambda level: memory, time=whole.time[:: args.every])
     names = list(whole.runs)
     judged = runs_of(names, args.judged) if args.judged else []
     pool = (
@@ -102,7 +104,7 @@ class Replay:
             done = method != "expected-reduction"
             for count in counts if done else [len(chosen)]:
                 if count in counts or not done:
-                    surrogate = self.train(chosen[:count])
+                    surrogate = self.trained(chosen[:count])
                     if count in counts:
                         judgement = Known.of(surrogate, self.box).judge(0.9)
                         out[count] = (self.error(surrogate, judged), (judgement.error, judgement.low, judgement.high))
@@ -110,7 +112,7 @@ class Replay:
                 return out
             chosen += self.ask(surrogate, chosen, pool)
 
-    def train(self, runs: list[int]) -> Surrogate:
+    def trained(self, runs: list[int]) -> Surrogate:
         some = replace(
             self.whole, parameters=self.whole.parameters[runs], runs=tuple(self.whole.runs[k] for k in runs),
             displacement=lambda level: self.memory[runs],
@@ -122,9 +124,9 @@ class Replay:
         known = Known.of(surrogate, self.box)
         left = [k for k in pool if k not in set(chosen)]
         over = known.parameters(known.points(0, 512))
-        weights = known.size(over) ** 2
+        weights = known.size(over)
         if self.local:
-            weights = weights * known.wrongness(over)
+            weights = weights * np.sqrt(known.wrongness(over))
         method = ExpectedReduction(known.posterior(self.whole.parameters[chosen]), over, weights)
         asked = method.ask(self.whole.parameters[left], self.batch)
         return [left[int(np.flatnonzero((self.whole.parameters[left] == row).all(axis=1))[0])] for row in asked]

@@ -158,7 +158,7 @@ class Known:
 
         over, candidates = self.points(seed, _OVER), self.points(seed + 1, _CANDIDATES)
         belief = self.posterior(known)
-        method = ExpectedReduction(belief, self.parameters(over), self.size(self.parameters(over)) ** 2)
+        method = ExpectedReduction(belief, self.parameters(over), self.size(self.parameters(over)))
         chosen = method.ask(self.parameters(candidates), count)
         found = self.parameters(candidates)
         share = self.fall(known, chosen, seed)

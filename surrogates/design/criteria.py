@@ -1,11 +1,12 @@
 """Which point to compute next, given what a process believes: small objects with `ask` and `tell`.
 
-A process with one kernel for all outputs knows where it will be how sure without knowing what it will see: its posterior
-variance depends on the places of the runs alone. The run that lowers the variance averaged over the box most is asked
+A process with one kernel for all outputs knows how sure it will be anywhere without knowing what it will see: its posterior
+variance depends on the places of the runs alone. The run that lowers the deviation averaged over the box most is asked
 for first, then counted as computed, and so on, so that a batch does not cluster.
 
-Sources: Cohn, Ghahramani, Jordan 1996, "Active learning with statistical models", section 4 (expected reduction of the
-variance integrated over the box); Gramacy and Apley 2015, equation 5 (the greedy step).
+Sources: Cohn, Ghahramani, Jordan 1996, "Active learning with statistical models", section 4 (expected reduction of
+the variance integrated over the box; here of its root, since that is what an error is proportional to); Gramacy and
+Apley 2015, equation 5 (the greedy step).
 """
 
 from __future__ import annotations
@@ -61,11 +62,23 @@ class Posterior:
     def reductions(
         self, candidates: NDArray[np.float64], over: NDArray[np.float64], weights: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """(candidate,): how much a run at each candidate, with its images, lowers the weighted mean variance at `over`."""
+        """(candidate,): how much a run at each candidate, with its images, lowers the weighted sum of deviations at `over`.
+
+        A deviation is the root of the posterior variance with the noise of a run: what an error is proportional to.
+        """
+        falls, before = self._falls(candidates, over)
+        after = np.maximum(before[None] - falls, self.noise)
+        return np.asarray((np.sqrt(before)[None] - np.sqrt(after)) @ weights)
+
+    def _falls(
+        self, candidates: NDArray[np.float64], over: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(candidate, over): by how much the variance at `over` falls with a run at each candidate; (over,): what it is."""
         seen, solve = self._seen()
         x = self.inputs(over)[0]
         images = self.inputs(candidates)
         known_over = solve(self.kernel(seen, x))
+        before = _diagonal(self.kernel, x) - (self.kernel(x, seen) * known_over.T).sum(axis=1) + self.noise
         to_over = [self.kernel(c, x) - self.kernel(c, seen) @ known_over for c in images]
         known_images = [solve(self.kernel(seen, c)) for c in images]
         inner = np.empty((len(candidates), len(images), len(images)))
@@ -75,7 +88,7 @@ class Posterior:
                 inner[:, a, b] = _between(self.kernel, first, second) - (towards * known_images[b].T).sum(axis=1)
             inner[:, a, a] += self.noise + 1e-10
         outer = np.stack(to_over, axis=1)  # (candidate, image, over)
-        return np.asarray(np.einsum("cao,cao,o->c", outer, np.linalg.solve(inner, outer), weights))
+        return np.einsum("cao,cao->co", outer, np.linalg.solve(inner, outer)), np.maximum(before, self.noise)
 
     def with_runs(self, points: NDArray[np.float64]) -> Posterior:
         """The same process once `points` (point, parameter) are computed."""

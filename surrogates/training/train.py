@@ -114,6 +114,11 @@ def _judge_by_folds(surrogate: Surrogate, trainer: Trainer, found: PodFit) -> No
     gathered = gather(distances())
     if errors:
         record.errors[next(iter(surrogate.level_names))] = float(np.mean(errors))
+    for place in sorted(set(places)):  # several folds may have left a run out
+        of_run = np.flatnonzero(np.array(places) == place)
+        record.left_out[record.fitted_runs[place]] = (
+            float(np.array(errors)[of_run].mean()), float(np.array(deviations)[of_run].mean())
+        )  # fmt: skip
     if len(set(places)) < FEWEST_BY_FOLDS:
         trainer.notes.add(
             f"there is no band: it takes {FEWEST_BY_FOLDS} training runs, and there are {len(set(places))}"
