@@ -98,12 +98,8 @@ class Record:
 
 def record_as_dict(record: Record) -> dict[str, Any]:
     """Plain values for JSON, without the histories."""
-    ranges = record.ranges
     out = asdict(record)
-    out["ranges"] = {
-        "names": list(ranges.names), "units": list(ranges.units), "low": ranges.low.tolist(),
-        "high": ranges.high.tolist(), "time": list(ranges.time), "table": [list(unit) for unit in ranges.written],
-    }  # fmt: skip
+    out["ranges"] = ranges_as_dict(record.ranges)
     out["time"] = record.time.tolist()
     out["fits"] = {
         str(k): {"best_epoch": f.best_epoch, "best": f.best, "seconds": f.seconds, "status": f.status}
@@ -114,13 +110,8 @@ def record_as_dict(record: Record) -> dict[str, Any]:
 
 def record_from_dict(values: Mapping[str, Any], histories: Mapping[int, dict[str, list[float]]]) -> Record:
     """The way back; raises KeyError or TypeError where something is missing."""
-    ranges = values["ranges"]
     return Record(
-        ranges=Ranges(
-            tuple(ranges["names"]), tuple(ranges["units"]), np.array(ranges["low"], np.float64),
-            np.array(ranges["high"], np.float64), (float(ranges["time"][0]), float(ranges["time"][1])),
-            tuple((str(unit), float(factor)) for unit, factor in ranges.get("table", ())),
-        ),
+        ranges=ranges_from_dict(values["ranges"]),
         time=np.array(values["time"], np.float64),
         checksum=values["checksum"],
         fitted_runs=tuple(values["fitted_runs"]),
@@ -140,6 +131,23 @@ def record_from_dict(values: Mapping[str, Any], histories: Mapping[int, dict[str
         parameters={str(k): [float(x) for x in v] for k, v in values.get("parameters", {}).items()},
         left_out={str(k): (float(e), float(d)) for k, (e, d) in values.get("left_out", {}).items()},
         notes=list(values["notes"]),
+    )  # fmt: skip
+
+
+def ranges_as_dict(ranges: Ranges) -> dict[str, Any]:
+    """Plain values."""
+    return {
+        "names": list(ranges.names), "units": list(ranges.units), "low": ranges.low.tolist(),
+        "high": ranges.high.tolist(), "time": list(ranges.time), "table": [list(unit) for unit in ranges.written],
+    }  # fmt: skip
+
+
+def ranges_from_dict(values: Mapping[str, Any]) -> Ranges:
+    """The way back."""
+    return Ranges(
+        tuple(values["names"]), tuple(values["units"]), np.array(values["low"], np.float64),
+        np.array(values["high"], np.float64), (float(values["time"][0]), float(values["time"][1])),
+        tuple((str(unit), float(factor)) for unit, factor in values.get("table", ())),
     )  # fmt: skip
 
 

@@ -42,10 +42,13 @@ class MlpSettings(_Frozen):
         Widths of the hidden layers; the output layer is linear.
     activation
         Activation function of the hidden layers.
+    members
+        Number of networks whose mean is taken, where the regression is chosen by folds.
     """
 
     widths: tuple[Positive, ...] = (64, 64, 64)
     activation: Literal["elu", "gelu", "silu", "tanh"] = "elu"
+    members: Positive = 1
 
 
 class LevelSettings(_Frozen):
@@ -72,8 +75,10 @@ class LevelSettings(_Frozen):
     mlp
         The network from parameters and time to the latent vector.
     regression
-        `network`: the MLP; `process`: a Gaussian process over whole runs, fitted to the encoded training states;
-        `mean` of both; `auto`: the best of the three on validation runs. Levels that are trained together use the MLP.
+        `network`: the MLP, trained with the reduction; `process`: a Gaussian process over whole runs, fitted to the
+        encoded training states; `mean` of both; `auto`: the mixture that is best on runs left out. All but `network`
+        train the MLP on encoded states, leaving out folds of the runs in turn. Levels that are trained together use
+        the MLP.
     epochs, batch
         Passes over the training states; states per step.
     learning_rate, schedule, optimiser, weight_decay
@@ -82,6 +87,10 @@ class LevelSettings(_Frozen):
         Largest norm of a gradient; 0: no limit.
     rate_inputs
         The learning rate of a layer is scaled by min(1, rate_inputs / number of its inputs); 0: off.
+    patience
+        Share of its epochs after which a training ends that gets no better on runs left out; 0: never.
+    first_state
+        `learned`, or `kept`: where all training runs start undeformed, so do predictions.
     weight_approximation, weight_reconstruction
         Weights of the two parts of the loss (section 3.3).
     """
@@ -104,6 +113,8 @@ class LevelSettings(_Frozen):
     weight_decay: Annotated[float, Field(ge=0)] = 0.0
     clip: Annotated[float, Field(ge=0)] = 0.0
     rate_inputs: Annotated[int, Field(ge=0)] = 0
+    patience: Annotated[float, Field(ge=0, le=1)] = 0.0
+    first_state: Literal["learned", "kept"] = "learned"
     weight_approximation: Annotated[float, Field(ge=0)] = 1.0
     weight_reconstruction: Annotated[float, Field(ge=0)] = 1.0
 
@@ -348,9 +359,9 @@ class Settings(_Frozen):
 # The fast preset keeps the paper's architecture and loss; `docs/surrogates.md` has the measurements behind it.
 _FAST: dict[str, Any] = {
     "level": {
-        "latent": 16,
+        "latent": 48,
         "start": "pod",
-        "mlp": {"widths": [64] * 6, "activation": "gelu"},
+        "mlp": {"widths": [64] * 6, "activation": "gelu", "members": 2},
         "epochs": 300,
         "batch": 64,
         "learning_rate": 4e-3,
@@ -358,6 +369,8 @@ _FAST: dict[str, Any] = {
         "weight_decay": 0.1,
         "rate_inputs": 16,
         "regression": "auto",
+        "patience": 0.2,
+        "first_state": "kept",
     },
     "transfer": {"upsampling": "sparse", "mlp": "residual", "epochs": 0.2},
 }

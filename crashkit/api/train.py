@@ -115,8 +115,7 @@ def train(
         check_model_folder(folder, overwrite)
     elif resume:
         raise SurrogateError("resume goes on with a training beside its model folder; give output")
-    by_folds = chosen.model in ("pod-gpr", "pod-rbf")
-    symmetry = by_folds and chosen.physics.symmetry == "auto"
+    symmetry = chosen.model in ("mh", "podnn", "pod-gpr", "pod-rbf") and chosen.physics.symmetry == "auto"
     campaign = open_campaign(source_of(dataset, hierarchy), test, symmetry=symmetry)
     state = None if folder is None else folder.with_name(f".{folder.name}.training")
     with (

@@ -118,6 +118,7 @@ class InputScaling(nn.Module):
     def __init__(self, ranges: Ranges, *, products: bool = False, angles: bool = False) -> None:
         super().__init__()
         self.products = products
+        self.ranges = ranges
         self.angles = tuple(k for k, u in enumerate(ranges.units) if angles and u in ("degree", "deg", "°"))
         corners = np.stack([np.append(ranges.low, ranges.time[0]), np.append(ranges.high, ranges.time[1])])
         features = self._features(torch.from_numpy(_grid(corners[0], corners[1])))
@@ -127,6 +128,11 @@ class InputScaling(nn.Module):
     @property
     def size(self) -> int:
         return len(self.low)
+
+    @property
+    def time_column(self) -> int:
+        """Place of the time among the columns: behind the parameters."""
+        return len(self.ranges.names)
 
     def forward(self, parameters: Tensor, time: Tensor) -> Tensor:
         raw = torch.cat([parameters, time[:, None]], dim=1).to(self.low.dtype)

@@ -74,12 +74,14 @@ def build_level(number: int, settings: Settings, graphs: Graphs, cascade: Cascad
     coarse = None if coarse_number is None else cascade.levels[coarse_number]
     concat = settings.transfer.encoder == "concat" and coarse is not None
     below = 0 if coarse is None else coarse.latent
+    # A mesh of few nodes has fewer displacements than the latent vector may have numbers; a finer level adds the rest.
+    own = own.model_copy(update={"latent": min(own.latent, 3 * graphs.n_nodes(number))})
     latent = own.latent + (below if concat else 0)
     reduction = make_reduction(own, graphs.edges(number), graphs.n_nodes(number), latent)
     extra = latent if settings.inputs.initial_state else 0
     regressor = Regressor(
         cascade.inputs.size + extra, latent, own.mlp.widths, own.mlp.activation,
-        coarse=below, residual=settings.transfer.mlp == "residual",
+        coarse=below, residual=settings.transfer.mlp == "residual", members=own.mlp.members,
     )  # fmt: skip
     more: dict[str, Any] = {}
     if coarse is not None and coarse_number is not None:
@@ -90,5 +92,5 @@ def build_level(number: int, settings: Settings, graphs: Graphs, cascade: Cascad
         }
     return LevelNetwork(
         reduction, regressor, n_nodes=graphs.n_nodes(number), latent=latent, concat=concat,
-        with_initial=settings.inputs.initial_state, **more,
+        with_initial=settings.inputs.initial_state, time_column=cascade.inputs.time_column, **more,
     )  # fmt: skip

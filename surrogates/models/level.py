@@ -17,7 +17,7 @@ from surrogates.models.base import take_over
 from surrogates.operators.upsampling import Upsampling
 from surrogates.reductions.reduction import LinearReduction, Reduction
 from surrogates.regression.latent_process import LatentProcess
-from surrogates.regression.network import Regressor
+from surrogates.regression.network import Course, Regressor
 
 
 @dataclass(frozen=True)
@@ -50,9 +50,13 @@ class LevelNetwork(nn.Module):
     in_finer    (coarse node,) places of the coarse nodes among this level's: D
     with_initial  the encoded first state z0 is a further input of the regression
     process     a Gaussian process whose answer is mixed into that of mlp*, once the level is trained
+    course      what all runs go through; the regression adds to it
+    at_rest     all training runs start undeformed, so zero is encoded as zero and decoded as zero
+    time_column  place of the scaled time among the inputs
     """
 
     in_finer: Tensor
+    rest: Tensor | None
 
     def __init__(
         self,
@@ -67,6 +71,7 @@ class LevelNetwork(nn.Module):
         in_finer: NDArray[np.int64] | None = None,
         concat: bool = False,
         with_initial: bool = False,
+        time_column: int = -1,
     ) -> None:
         super().__init__()
         if (coarse is None) != (upsampling is None) or (coarse is None) != (in_finer is None):
@@ -79,7 +84,11 @@ class LevelNetwork(nn.Module):
         self.concat = concat
         self.with_initial = with_initial
         self.upsampling = upsampling
+        self.time_column = time_column
         self.process: LatentProcess | None = None
+        self.course: Course | None = None
+        self.at_rest = False
+        self.register_buffer("rest", None, persistent=False)
         self.coarse: LevelNetwork | None = coarse
         if coarse is not None and in_finer is not None:
             coarse.requires_grad_(False)
@@ -92,17 +101,37 @@ class LevelNetwork(nn.Module):
 
     def encode(self, x: Tensor, known: Known | None = None) -> Tensor:
         """(node, b, 3) -> (b, latent)"""
-        own = self.reduction.encode(x)
+        own = self._encoded(x)
         if self.coarse is None:
             return own
         if known is not None and known.encoded is not None:
             below = known.encoded
         else:
             below = self.coarse.encode(self.restrict(x))
-        return torch.cat([below, own], dim=1) if self.concat else below + own
+        return torch.cat([below, own], dim=1) if self.concat else _padded(below, own.shape[1]) + own
 
     def decode(self, z: Tensor) -> Tensor:
         """(b, latent) -> (node, b, 3)"""
+        if not self.at_rest:
+            return self._decoded(z)
+        if self.rest is not None and not torch.is_grad_enabled():
+            return self._decoded(z).sub_(self.rest)
+        both = self._decoded(nn.functional.pad(z, (0, 0, 0, 1)))
+        return both[:, :-1] - both[:, -1:]
+
+    @torch.no_grad()
+    def settle(self) -> None:
+        """Training is over: what zero is decoded as need not be computed each time."""
+        if self.at_rest:
+            self.rest = self._decoded(next(self.reduction.parameters()).new_zeros(1, self.latent))
+
+    def _encoded(self, x: Tensor) -> Tensor:
+        if not self.at_rest or isinstance(self.reduction, LinearReduction):
+            return self.reduction.encode(x)
+        both = self.reduction.encode(nn.functional.pad(x.permute(2, 0, 1), (0, 1)).permute(1, 2, 0))
+        return both[:-1] - both[-1:]
+
+    def _decoded(self, z: Tensor) -> Tensor:
         own = self.reduction.decode(z)
         if self.coarse is None or self.upsampling is None:
             return own
@@ -127,7 +156,8 @@ class LevelNetwork(nn.Module):
         known_inputs = inputs
         if self.with_initial:
             inputs = torch.cat([inputs, self.encoded_initial(inputs, initial)], dim=1)
-        z = self.regressor(inputs, below)
+        course = None if self.course is None else self.course(known_inputs[:, self.time_column])
+        z = self.regressor(inputs, below, course)
         return z if self.process is None else torch.lerp(z, self.process(known_inputs), self.process.share)
 
     def encoded_initial(self, inputs: Tensor, initial: Tensor | None) -> Tensor:
@@ -145,9 +175,15 @@ class LevelNetwork(nn.Module):
 
     def load_own_state(self, tensors: dict[str, Tensor]) -> None:
         """Take over what `own_state` gave; raises SurrogateError naming what does not fit."""
-        process = {k.removeprefix("process."): v for k, v in tensors.items() if k.startswith("process.")}
-        if process:
-            self.process = LatentProcess.like(process)
+        parts: dict[str, dict[str, Tensor]] = {"process": {}, "course": {}}
+        for name, tensor in tensors.items():
+            part, _, rest = name.partition(".")
+            if part in parts:
+                parts[part][rest] = tensor
+        if parts["process"]:
+            self.process = LatentProcess.like(parts["process"])
+        if parts["course"]:
+            self.course = Course.like(parts["course"])
         take_over(self.own_state(), tensors)
 
     def parameter_counts(self) -> dict[str, int]:
@@ -166,6 +202,10 @@ class LevelNetwork(nn.Module):
             "upsampling": _numbers(self.upsampling) if moves and self.upsampling is not None else 0,
             "process": 0 if self.process is None else sum(b.numel() for b in self.process.buffers()),
         }
+
+
+def _padded(z: Tensor, length: int) -> Tensor:
+    return z if z.shape[1] == length else nn.functional.pad(z, (0, length - z.shape[1]))
 
 
 def _numbers(module: nn.Module) -> int:

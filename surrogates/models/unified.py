@@ -32,13 +32,17 @@ class Unified(Network):
         self.scale = 1.0
         finest = numbers[-1]
         own = settings.for_level(finest)
-        self.n_latent = own.latent
+        # No longer than the coarsest mesh has displacements.
+        self.n_latent = min([own.latent, *(3 * graphs.n_nodes(number) for number in numbers)])
         self.with_initial = settings.inputs.initial_state
         self.reductions = nn.ModuleDict()
         self.upsamplings = nn.ModuleDict()
         for k, number in enumerate(numbers):
             reduction = make_reduction(
-                settings.for_level(number), graphs.edges(number), graphs.n_nodes(number), own.latent
+                settings.for_level(number).model_copy(update={"latent": self.n_latent}),
+                graphs.edges(number),
+                graphs.n_nodes(number),
+                self.n_latent,
             )
             if number != finest:
                 reduction.decode_only()
@@ -46,8 +50,8 @@ class Unified(Network):
             if k:
                 up = graphs.upsampling(numbers[k - 1], number)
                 self.upsamplings[str(number)] = Upsampling(up, settings.transfer.upsampling)
-        extra = own.latent if self.with_initial else 0
-        self.regressor = Regressor(inputs.size + extra, own.latent, own.mlp.widths, own.mlp.activation)
+        extra = self.n_latent if self.with_initial else 0
+        self.regressor = Regressor(inputs.size + extra, self.n_latent, own.mlp.widths, own.mlp.activation)
         self.n_nodes = graphs.n_nodes(finest)
         self.places = {k: torch.from_numpy(graphs.places(k, finest)) for k in numbers[:-1]}
         self.to_finest = {k: graphs.upsampling(k, finest) for k in numbers[:-1]}

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogates.data.campaign import Campaign
+from surrogates.data.samples import Notes
 from surrogates.errors import SurrogateError
 from surrogates.physics.clock import Clock, neighbours
 from surrogates.physics.derived import (
@@ -33,7 +34,7 @@ from surrogates.physics.derived import (
 )
 from surrogates.physics.registration import Registration
 from surrogates.physics.symmetry import Symmetry, may_be_odd
-from surrogates.physics.trials import Trials
+from surrogates.physics.trials import Folds, Trials, courses_of
 from surrogates.settings import Settings
 
 _log = logging.getLogger(__name__)
@@ -281,3 +282,19 @@ def _sorted(speed: int, exponents: dict[int, float]) -> tuple[tuple[int, float],
     """The speed first, then the others that count, in order."""
     rest = sorted((k, v) for k, v in exponents.items() if k != speed and v)
     return ((speed, exponents.get(speed, 0.0)), *rest)
+
+
+def of_campaign(
+    campaign: Campaign,
+    settings: Settings,
+    notes: Notes,
+) -> tuple[Registration, Worth]:
+    """The registration of all training runs for models that are trained behind it, judged with processes by folds."""
+    if settings.physics.clock == settings.physics.symmetry == settings.inputs.derived == "off":
+        return Registration.identity(campaign.parameter_names, campaign.time), Worth()
+    everyone = np.arange(len(campaign.parameters))
+    courses = courses_of(campaign, settings, everyone, notes)
+    folds = Folds.of(len(everyone), settings.validation.folds, settings.seed)
+    trials = Trials(courses, campaign.parameters, folds, "pod-gpr", settings.seed)
+    registration, _, worth = choose(campaign, everyone, settings, trials)
+    return registration, worth

@@ -22,26 +22,57 @@ from surrogates.errors import SurrogateError
 from surrogates.models.base import Network
 from surrogates.operators.convolutions import exportable
 from surrogates.operators.upsampling import Upsampling
+from surrogates.physics.registration import Registration
 from surrogates.surrogate import Surrogate
 
 SUFFIXES = (".onnx", ".pt2")
 # Largest difference to the surrogate itself, relative to its largest displacement, at which a file is accepted.
-TOLERANCE = 1e-5
+TOLERANCE = 1e-4
 
 
 class LevelProgram(nn.Module):
     """(parameters, time) -> displacements of one level, lifted to the full mesh by its static U if asked."""
 
-    def __init__(self, network: Network, number: int, lift: Upsampling | None) -> None:
+    def __init__(
+        self, network: Network, number: int, lift: Upsampling | None, registration: Registration | None = None
+    ) -> None:
         super().__init__()
         self.network = network
+        self.registration = registration
         self.number = number
         self.lift = lift
 
     def forward(self, parameters: Tensor, time: Tensor) -> Tensor:
-        states = self.network(parameters, time, self.number)
-        result: Tensor = (states if self.lift is None else self.lift(states)).transpose(0, 1)
-        return result
+        inputs, size = parameters, None
+        if self.registration is not None and not self.registration.is_identity:
+            inputs, time, size = _registered(self.registration, parameters, time)
+        states = self.network(inputs, time, self.number)
+        out: Tensor = (states if self.lift is None else self.lift(states)).transpose(0, 1)
+        return out if size is None else out * size[:, None, None].to(out.dtype)
+
+
+def _registered(registration: Registration, parameters: Tensor, time: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Inputs (b, input), reference times (b,) and sizes (b,) of parameters (b, parameter) and times (b,)."""
+    columns = []
+    for column in registration.inputs.columns:
+        if column.logarithm:
+            terms = [power * parameters[:, k].log() for k, power in enumerate(column.powers) if power]
+            columns.append(torch.stack(terms).sum(dim=0))
+        else:
+            value = parameters[:, column.powers.index(1)]
+            columns.append(torch.asinh(value / column.width) if column.width else value)
+    if registration.symmetry.flagged:
+        columns.append(torch.zeros_like(parameters[:, 0]))
+    clock = registration.clock
+    rate = torch.ones_like(parameters[:, 0])
+    for k, power in enumerate(clock.exponents):
+        if power:
+            rate = rate * (parameters[:, k] / clock.reference[k]) ** power
+    size = torch.ones_like(rate)
+    if clock.speed is not None:
+        size = parameters[:, clock.speed] / clock.reference[clock.speed] / rate
+        time = clock.start + (time - clock.start) * rate
+    return torch.stack(columns, dim=1), time, size
 
 
 def export(surrogate: Surrogate, path: str | Path, level: int | None = None, *, full: bool = False) -> float:
@@ -64,7 +95,7 @@ def export(surrogate: Surrogate, path: str | Path, level: int | None = None, *, 
         )
     number = min(surrogate.core.numbers) if level is None else level
     lift = Upsampling(surrogate.graphs.to_full(number), "static") if full and number else None
-    program = LevelProgram(surrogate.core, number, lift).eval()
+    program = LevelProgram(surrogate.core, number, lift, surrogate.registration).eval()
     parameters, time = _probes(surrogate, _batch_unlike(program))
     states = surrogate.predict_full if full else surrogate.predict
     wanted = np.stack([states(p, t[None], number)[0] for p, t in zip(parameters, time, strict=True)])

@@ -37,7 +37,7 @@ from surrogates.models.cascade import Cascade, build_level
 from surrogates.models.pod_regression import PodRegression
 from surrogates.models.unified import Unified
 from surrogates.physics.registration import Registration
-from surrogates.record import Record, record_as_dict, record_from_dict
+from surrogates.record import Record, ranges_as_dict, ranges_from_dict, record_as_dict, record_from_dict
 from surrogates.settings import Settings, parse
 from surrogates.storage.card import card
 from surrogates.storage.checks import check_bands, check_core, check_graphs, check_labels, check_record, plain_files
@@ -136,9 +136,16 @@ def _write(surrogate: Surrogate, folder: Path) -> None:
         "format": FORMAT,
         "settings": surrogate.settings.as_dict(),
         "record": _plain(record_as_dict(record)),
+        "inputs": _plain(ranges_as_dict(core.inputs.ranges if isinstance(core, Network) else record.ranges)),
         "registration": _plain(surrogate.registration.as_dict()),
         "levels": [
-            {"number": k, "name": name, "nodes": surrogate.graphs.n_nodes(k), "scale": _scale(core, k)}
+            {
+                "number": k,
+                "name": name,
+                "nodes": surrogate.graphs.n_nodes(k),
+                "scale": _scale(core, k),
+                "at_rest": isinstance(core, Cascade) and core.levels[k].at_rest,
+            }
             for name, k in surrogate.level_names.items()
         ],
         "parts": [] if surrogate.labels is None else list(surrogate.labels.part_name),
@@ -175,7 +182,8 @@ def _core(
 ) -> Network | PodRegression:
     if settings.model in ("pod-gpr", "pod-rbf"):
         return PodRegression.load(load_file(folder / "pod.safetensors"), settings.model, record.choice["inputs"])
-    scaling = InputScaling(record.ranges, products=settings.inputs.products, angles=settings.inputs.angles)
+    ranges = ranges_from_dict(about["inputs"])
+    scaling = InputScaling(ranges, products=settings.inputs.products, angles=settings.inputs.angles)
     if settings.unified:
         network = Unified(scaling, settings, graphs, tuple(entry["number"] for entry in about["levels"]))
         network.scale = float(about["levels"][0]["scale"])
@@ -185,7 +193,9 @@ def _core(
     for entry in about["levels"]:
         level = build_level(entry["number"], settings, graphs, cascade)
         level.scale = float(entry["scale"])
+        level.at_rest = bool(entry["at_rest"])
         level.load_own_state(load_file(folder / f"level_{entry['number']}.safetensors"))
+        level.settle()
         cascade.add(entry["number"], level)
     return cascade
 

@@ -161,11 +161,11 @@ class _Writer:
 
     def at_zero(self, level: LevelNetwork, zero: Tensor) -> Tensor:
         """What a latent vector of zeros is decoded as, which a level at rest takes away: (node, 3)."""
-        level.at_rest = False  # type: ignore[assignment]
+        level.at_rest = False
         try:
             return level.decode(zero)[:, 0].contiguous()
         finally:
-            level.at_rest = True  # type: ignore[assignment]
+            level.at_rest = True
 
     def reduction(self, reduction: Reduction, z: str) -> str:
         if isinstance(reduction, SumReduction):

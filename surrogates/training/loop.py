@@ -116,6 +116,8 @@ def fit(
     started, spent = time.perf_counter(), out.seconds
     try:
         for epoch in range(out.epochs, settings.epochs):
+            if _enough(out, settings):
+                break
             sums = torch.zeros(2, device=device)
             for indices, rate in plan.batches(epoch):
                 sums += step(indices, rate)
@@ -132,7 +134,11 @@ def fit(
                 best = {k: v.detach().clone() for k, v in names.items()}
             if report is not None and plan.rank == 0:
                 report(_told(name, settings.epochs, out, objective.scale))
-            if keeper is not None and plan.rank == 0 and (keeper.due(epoch + 1) or epoch + 1 == settings.epochs):
+            if (
+                keeper is not None
+                and plan.rank == 0
+                and (keeper.due(epoch + 1) or epoch + 1 == settings.epochs or _enough(out, settings))
+            ):
                 keeper.save(name, _tensors(names, best, optimiser, trained), _about(out))
     except KeyboardInterrupt:
         if not best:
@@ -181,6 +187,13 @@ def learning_rates(settings: LevelSettings, steps: int) -> NDArray[np.float64]:
     low = 1e-3 * top
     down = low + (top - low) * 0.5 * (1 + np.cos(np.pi * np.linspace(0, 1, max(steps - rise, 1))))
     return np.concatenate([up, down])[:steps]
+
+
+def _enough(out: Fit, settings: LevelSettings) -> bool:
+    """Whether the last `settings.patience` of the epochs brought nothing on runs that are left out."""
+    if not settings.patience or "validation_total" not in out.history:
+        return False
+    return out.epochs - out.best_epoch >= math.ceil(settings.patience * settings.epochs)
 
 
 class _Plan:

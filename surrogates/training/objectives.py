@@ -61,11 +61,16 @@ def as_states(rows: Tensor) -> Tensor:
 
 
 class LevelObjective(Objective):
-    """mean((x - dec(mlp))^2) and mean((x - dec(enc(x)))^2) of one level; both decoded in one pass (equation 8)."""
+    """mean((x - dec(mlp))^2) and mean((x - dec(enc(x)))^2) of one level; both decoded in one pass (equation 8).
 
-    def __init__(self, level: LevelNetwork, training: Samples, validation: Samples | None) -> None:
+    With `reduction_alone` the regression is left for later, and both are the latter.
+    """
+
+    def __init__(
+        self, level: LevelNetwork, training: Samples, validation: Samples | None, *, reduction_alone: bool = False
+    ) -> None:
         super().__init__()
-        self.level = level
+        self.level, self.reduction_alone = level, reduction_alone
         self.training_samples, self.validation_samples = training, validation
         self.size = len(training)
 
@@ -97,6 +102,9 @@ class LevelObjective(Objective):
 
     def _losses(self, samples: Samples, index: Tensor) -> Tensor:
         x, inputs, known, initial = samples.batch(index)
+        if self.reduction_alone:
+            lost = (self.level.decode(self.level.encode(x, known)) - x).square().mean().float()
+            return torch.stack([lost, lost])
         z = torch.cat([self.level.regress(inputs, known, initial), self.level.encode(x, known)])
         difference = self.level.decode(z).unflatten(1, (2, len(index))) - x[:, None]
         result: Tensor = difference.square().mean(dim=(0, 2, 3)).float()

@@ -1,8 +1,10 @@
 """Linear parts of a reduction, computed from the training states instead of trained from nothing.
 
 On the coarsest level they are POD modes, each divided by its coefficients' RMS, so that latent vectors are of order
-one. On a finer level they make up what the upsampled coarse reconstruction leaves: with `add`, the regression of that
-remainder on the coarse latent vector; with `concat`, modes of the detail x - U D x beside it.
+one. On a finer level with `add` the latent vectors become those of the level's own POD, turned within the modes so that
+they agree with the coarse ones as far as they can (orthogonal Procrustes problem: Schoenemann 1966,
+doi 10.1007/BF02289451); with `concat`, modes of the detail x - U D x stand beside the coarse latent vector. The decoder
+makes up what the upsampled coarse reconstruction leaves, by regression on the latent vector.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from data_schema.pod import pod
 from surrogates.errors import SurrogateError
 from surrogates.models.level import LevelNetwork
 from surrogates.models.unified import Unified
-from surrogates.reductions.reduction import LinearReduction, LinearStart, flat
+from surrogates.reductions.reduction import LinearReduction, LinearStart, flat, linear_part
 
 # Gives the training states, some (node, b, 3) at a time, as often as it is called.
 Batches = Callable[[], Iterator[Tensor]]
@@ -59,6 +61,10 @@ def start_level(level: LevelNetwork, linear: LinearReduction, batches: Batches) 
     if level.concat:
         detail = pod_start((x - _interpolated(level, x) for x in batches()), own, level.n_nodes)
         linear.encode_matrix.copy_(detail.encode - _back(level, detail.encode))
+    else:
+        modes = pod_start(batches(), own, level.n_nodes)
+        turned = _turned(modes.encode, batches(), level)
+        linear.encode_matrix.copy_(turned - _below(level, own))
     linear.decode_matrix.zero_()
     linear.offset.zero_()
 
@@ -67,7 +73,7 @@ def start_level(level: LevelNetwork, linear: LinearReduction, batches: Batches) 
             z = level.encode(x)
             yield z, x - level.lifted(z)
 
-    _regress(linear, remainders())
+    _regress(linear, remainders(), at_rest=level.at_rest)
 
 
 @torch.no_grad()
@@ -90,19 +96,45 @@ def start_unified(network: Unified, batches: Batches) -> None:
         _regress(part, remainders())
 
 
-def _regress(linear: LinearReduction, pairs: Iterable[tuple[Tensor, Tensor]]) -> None:
-    """Set the decoder to the least-squares map from z (b, latent) to states (node, b, 3)."""
+def _regress(linear: LinearReduction, pairs: Iterable[tuple[Tensor, Tensor]], *, at_rest: bool = False) -> None:
+    """Set the decoder to the least-squares map from z (b, latent) to states (node, b, 3); zero from zero with `at_rest`."""
     size = linear.decode_matrix.shape[1] + 1
     moments = torch.zeros(size, size, dtype=torch.float64)
     product = torch.zeros(size, len(linear.offset), dtype=torch.float64)
     for z, left in pairs:
-        with_one = torch.cat([z, torch.ones_like(z[:, :1])], dim=1).double()
+        constant = torch.full_like(z[:, :1], 0.0 if at_rest else 1.0)
+        with_one = torch.cat([z, constant], dim=1).double()
         moments += with_one.T @ with_one
         product += with_one.T @ flat(left).double()
-    ridge = torch.diag(_RIDGE * moments.diagonal().clamp_min(1e-12))
+    ridge = torch.diag((_RIDGE * moments.diagonal()).clamp_min(_RIDGE * 1e-12))
     solved = torch.linalg.solve(moments + ridge, product).float()
     linear.decode_matrix.copy_(solved[:-1].T)
     linear.offset.copy_(solved[-1])
+
+
+def _turned(encode: Tensor, batches: Iterator[Tensor], level: LevelNetwork) -> Tensor:
+    """The encoder (3 * node, r) of POD, its latent numbers turned towards those of the coarse level."""
+    agreement = torch.zeros(encode.shape[1], encode.shape[1], dtype=torch.float64)
+    for x in batches:
+        below = level.coarse.encode(level.restrict(x))  # type: ignore[union-attr]
+        agreement[:, : below.shape[1]] += ((flat(x) @ encode).T @ below).double()
+    left, _, right = torch.linalg.svd(agreement)
+    turned: Tensor = encode @ (left @ right).float()
+    return turned
+
+
+def _below(level: LevelNetwork, latent: int) -> Tensor:
+    """(3 * node, latent): what the coarse levels' linear parts encode, as columns over this level's nodes."""
+    out = torch.zeros(level.n_nodes, 3, latent)
+    coarse = level.coarse
+    if coarse is None:
+        return out.flatten(0, 1)
+    linear = linear_part(coarse.reduction)
+    if linear is not None:
+        own = linear.encode_matrix
+        whole = _below(coarse, own.shape[1]) + own
+        out[level.in_finer, :, : own.shape[1]] = whole.unflatten(0, (coarse.n_nodes, 3)) / level.ratio
+    return out.flatten(0, 1)
 
 
 def _interpolated(level: LevelNetwork, x: Tensor) -> Tensor:

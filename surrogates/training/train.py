@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +16,16 @@ from surrogates.errors import SurrogateError
 from surrogates.models.cascade import Cascade
 from surrogates.models.pod_regression import PodFit, fit_pod_regression
 from surrogates.models.unified import Unified
+from surrogates.physics.choice import of_campaign
+from surrogates.physics.trials import Folds
 from surrogates.record import Fit, Record
 from surrogates.settings import Settings
 from surrogates.surrogate import Surrogate
+from surrogates.training.by_folds import FoldTrainer, chooses_by_folds
 from surrogates.training.loop import Diverged, Epoch, Keeper, device_of
 from surrogates.training.refinement import Refined
 from surrogates.training.trainer import Trainer
-from surrogates.uncertainty import FEWEST_BY_FOLDS, FEWEST_RUNS, Beliefs, calibrate, calibrate_gathered, gather
+from surrogates.uncertainty import FEWEST_BY_FOLDS, FEWEST_RUNS, Beliefs, calibrate_gathered, gather
 
 # Bytes of one run on the full mesh up to which lifted predictions are judged.
 _LARGEST_RUN = 2 << 30
@@ -46,7 +49,8 @@ def train_surrogate(
     """
     notes = Notes()
     check(campaign, settings, notes)
-    by_folds = settings.model in ("pod-gpr", "pod-rbf")
+    of_pod = settings.model in ("pod-gpr", "pod-rbf")
+    by_folds = of_pod or chooses_by_folds(settings, campaign)
     parts = everything(campaign, settings) if by_folds else split(campaign, settings, notes)
     graphs = Graphs.of(campaign)
     ranges = Ranges.of(
@@ -58,13 +62,38 @@ def train_surrogate(
     record.notes = notes.lines
     surrogate = Surrogate(settings, record, graphs, Cascade(scaling(settings, ranges)), campaign.points, campaign.faces)
     surrogate.labels = campaign.labels
-    if by_folds:
+    if of_pod:
         _fit_regression(surrogate, trainer)
-    elif settings.unified:
+        return surrogate
+    if by_folds:
+        trainer = _registered(surrogate, trainer)
+    if settings.unified:
         _fit_unified(surrogate, trainer)
     else:
         _fit_cascade(surrogate, trainer)
     return surrogate
+
+
+def _registered(surrogate: Surrogate, trainer: Trainer) -> FoldTrainer:
+    """A trainer on the registered campaign, whose folds hold a run and its image together."""
+    campaign, settings, record = trainer.campaign, trainer.settings, surrogate.record
+    registration, worth = of_campaign(campaign, settings, trainer.notes)
+    surrogate.registration = registration
+    record.physics = {**registration.told(), "errors": worth.errors}
+    inner = registration.apply(campaign, settings, trainer.notes)
+    count = len(campaign.parameters)
+    part = Folds.of(count, settings.validation.folds, settings.seed).part[0]
+    surrogate.core = Cascade(scaling(settings, ranges_of(inner)))
+    return FoldTrainer(
+        inner, settings, trainer.graphs, registration.split(trainer.split, count), trainer.notes, trainer.device,
+        trainer.report, trainer.keeper,
+        part=np.tile(part, len(inner.parameters) // count), original=campaign, registration=registration,
+    )  # fmt: skip
+
+
+def ranges_of(campaign: Campaign) -> Ranges:
+    """What the runs of a campaign cover."""
+    return Ranges.of(campaign.parameter_names, campaign.parameter_units, campaign.parameters, campaign.time)
 
 
 def scaling(settings: Settings, ranges: Ranges) -> InputScaling:
@@ -124,6 +153,13 @@ def _judge_by_folds(surrogate: Surrogate, trainer: Trainer, found: PodFit) -> No
             f"there is no band: it takes {FEWEST_BY_FOLDS} training runs, and there are {len(set(places))}"
         )
         return
+    record.left_out = {
+        record.fitted_runs[place]: (
+            float(np.mean([e for e, p in zip(errors, places, strict=True) if p == place])),
+            float(np.mean([d for d, p in zip(deviations, places, strict=True) if p == place])),
+        )
+        for place in sorted(set(places))
+    }
     sizes = found.registration.clock.size(trainer.campaign.parameters[runs[places]])
     surrogate.bands[0, False] = calibrate_gathered(
         gathered, record.time, Beliefs(sizes, np.array(deviations)), np.array(places)
@@ -179,46 +215,93 @@ def _fit_cascade(surrogate: Surrogate, trainer: Trainer) -> None:
     _judge(surrogate, trainer)
 
 
+# A run, and the distances (state, node), m, between its truth and what is said of it without it.
+_Judged = tuple[int, NDArray[np.float32]]
+
+
 def _judge(surrogate: Surrogate, trainer: Trainer) -> None:
-    """Note errors e2 (m) over the validation runs, and calibrate the bands on them: on own nodes, and lifted."""
-    held = trainer.split.validation
-    if not len(held):
+    """Note errors e2 (m) over runs that were left out, and calibrate the bands on them: on own nodes, and lifted."""
+    if isinstance(trainer, FoldTrainer):
+        surrogate.record.choice = _choices(surrogate, trainer)
+    elif not len(trainer.split.validation):
         trainer.notes.add("no runs were held out, so there is neither a validation error nor a band")
         return
     full = _full_field(trainer)
     for name, number in surrogate.level_names.items():
-        runs = trainer.runs(number, surrogate.graphs)
-        own, lifted, reduced = [], [], []
-        for run in held:
-            truth = runs.read(run)
-            predicted = _predicted(surrogate, trainer.campaign, run, number)
-            own.append(_distance(predicted, truth))
-            reduced.append(_distance(surrogate.reconstruct(truth, number), truth).mean())
-            if full is not None and number > 0:
-                lifted.append(_distance(surrogate.lift(predicted, number), full.read(run)))
-        _note(surrogate, name, number, own, lifted)
+        runs = trainer.judged(number, surrogate.graphs)
+        reduced: list[float] = []
+
+        def own(number: int = number, runs: LevelRuns = runs, reduced: list[float] = reduced) -> Iterator[_Judged]:
+            for run, predicted in _left_out(surrogate, trainer, number):
+                truth = runs.read(run)
+                reduced.append(float(_distance(surrogate.reconstruct(truth, number), truth).mean()))
+                yield run, _distance(predicted, truth)
+
+        def lifted(number: int = number) -> Iterator[_Judged]:
+            for run, predicted in _left_out(surrogate, trainer, number):
+                if full is not None:
+                    yield run, _distance(surrogate.lift(predicted, number), full.read(run))
+
+        _note(surrogate, trainer, name, (number, False), own())
+        if full is not None and number > 0:
+            _note(surrogate, trainer, f"{name}, lifted to the full mesh", (number, True), lifted())
         surrogate.record.errors[f"{name}, reduction alone"] = float(np.mean(reduced))
 
 
+def _left_out(surrogate: Surrogate, trainer: Trainer, number: int) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    """Runs, and what is said of them (state, node, 3), m, without them."""
+    if isinstance(trainer, FoldTrainer) and isinstance(surrogate.core, Cascade):
+        yield from enumerate(trainer.left_out(number, surrogate.core.levels[number]))
+        return
+    for run in trainer.split.validation:
+        yield int(run), _predicted(surrogate, trainer.campaign, run, number)
+
+
+def _choices(surrogate: Surrogate, trainer: FoldTrainer) -> dict[str, str]:
+    """What was chosen for each level, from what, in words."""
+    out = {}
+    for name, number in surrogate.level_names.items():
+        chosen, fit = trainer.chosen[number], surrogate.record.fits[number]
+        tried = ", ".join(f"{what} {100 * error:.2f} cm" for what, error in chosen.errors.items())
+        epochs = f"; network {fit.best_epoch} of {fit.epochs} epochs" if chosen.share < 1 and fit.epochs else ""
+        trained = (
+            f"; reduction {chosen.reduction_epochs} epochs" if chosen.reduction_epochs else "; reduction as computed"
+        )
+        out[name] = f"{chosen.told} ({tried}){epochs}{trained}"
+    return out
+
+
 def _note(
-    surrogate: Surrogate,
-    name: str,
-    number: int,
-    own: list[NDArray[np.float32]],
-    lifted: list[NDArray[np.float32]],
+    surrogate: Surrogate, trainer: Trainer, label: str, band: tuple[int, bool], judged: Iterable[_Judged]
 ) -> None:
-    """Errors and bands from distances (state, node), one array for each validation run."""
-    for distances, is_lifted in ((own, False), (lifted, True)):
-        if distances:
-            label = f"{name}, lifted to the full mesh" if is_lifted else name
-            surrogate.record.errors[label] = float(np.mean([d.mean() for d in distances]))
-        if len(distances) >= FEWEST_RUNS:
-            surrogate.bands[number, is_lifted] = calibrate(distances, surrogate.record.time)
+    """The error, and the band where runs are enough, from distances on runs that were left out."""
+    record, campaign = surrogate.record, trainer.judged_campaign
+    places: list[int] = []
+    errors: list[float] = []
+
+    def distances() -> Iterator[NDArray[np.float32]]:
+        for run, distance in judged:
+            places.append(run)
+            errors.append(float(distance.mean()))
+            yield distance
+
+    gathered = gather(distances())
+    record.errors[label] = float(np.mean(errors))
+    by_folds = isinstance(trainer, FoldTrainer)
+    if by_folds and band == (min(surrogate.core.numbers), False):
+        record.left_out = {name: (error, 1.0) for name, error in zip(record.fitted_runs, errors, strict=True)}
+    fewest = FEWEST_BY_FOLDS if by_folds else FEWEST_RUNS
+    if len(places) < fewest:
+        kind = "training" if by_folds else "validation"
+        trainer.notes.add(f"there is no band: it takes {fewest} {kind} runs, and there are {len(places)}")
+        return
+    sizes = surrogate.registration.clock.size(campaign.parameters[places])
+    surrogate.bands[band] = calibrate_gathered(gathered, record.time, Beliefs(sizes, np.ones(len(places))))
 
 
 def _full_field(trainer: Trainer) -> LevelRuns | None:
-    """The full mesh's displacements, of which the validation runs alone are read; None where one run is too large."""
-    campaign = trainer.campaign
+    """The full mesh's displacements, of which runs left out alone are read; None where one run is too large."""
+    campaign = trainer.judged_campaign
     if len(campaign.time) * campaign.n_nodes * 12 > _LARGEST_RUN:
         trainer.notes.add("a run of the full mesh is too large to judge lifted predictions while training")
         return None
@@ -227,9 +310,15 @@ def _full_field(trainer: Trainer) -> LevelRuns | None:
 
 def node_errors(surrogate: Surrogate, trainer: Trainer, number: int) -> NDArray[np.float64]:
     """Mean distance (node,), m, of prediction and truth over states and validation runs (training runs without any)."""
-    held = trainer.split.validation if len(trainer.split.validation) else trainer.split.training
-    runs: LevelRuns = trainer.runs(number, surrogate.graphs)
+    runs: LevelRuns = trainer.judged(number, surrogate.graphs)
     total = np.zeros(surrogate.graphs.n_nodes(number))
+    if isinstance(trainer, FoldTrainer):
+        told = list(_left_out(surrogate, trainer, number))
+        mean: NDArray[np.float64] = np.mean(
+            [_distance(said, runs.read(run)).mean(axis=0) for run, said in told], axis=0, dtype=np.float64
+        )
+        return mean
+    held = trainer.split.validation if len(trainer.split.validation) else trainer.split.training
     for run in held:
         total += _distance(_predicted(surrogate, trainer.campaign, run, number), runs.read(run)).mean(axis=0)
     return total / len(held)

@@ -20,11 +20,16 @@ from surrogates.models.unified import Unified
 from surrogates.record import Fit
 from surrogates.reductions.reduction import LinearReduction, LinearStart, linear_part
 from surrogates.regression.latent_process import mix_in
+from surrogates.regression.network import Course
 from surrogates.settings import LevelSettings, Settings
 from surrogates.surrogate import Surrogate, level_name
-from surrogates.training.loop import Epoch, Keeper, Objective, fit, set_up
+from surrogates.training.loop import Epoch, Keeper, Objective, set_up
+from surrogates.training.loop import fit as run_epochs
 from surrogates.training.objectives import CHUNK, LatentObjective, LevelObjective, Samples, UnifiedObjective, as_states
 from surrogates.training.starts import pod_start, start_level, start_unified
+
+# Share of the largest displacement below which a first state is undeformed.
+UNDEFORMED = 1e-6
 
 
 @dataclass
@@ -42,30 +47,30 @@ class Trainer:
 
     def level(self, number: int, cascade: Cascade, graphs: Graphs) -> Fit:
         """Train level `number` and put it on top of `cascade`."""
-        seed = self._seeded(number)
+        seed = self.seeded(number)
         runs = self.runs(number, graphs)
         level = build_level(number, self.settings, graphs, cascade)
         fixed = isinstance(level.reduction, LinearReduction) and level.coarse is None and not level.with_initial
-        inputs, held_inputs = (self._inputs(cascade.inputs, part) for part in self._parts)
-        make = self._on_coefficients if fixed else self._on_states
-        objective = make(level, runs, inputs, held_inputs)
+        make = self._on_coefficients if fixed else self.on_states
+        objective = make(level, runs, cascade.inputs, *self._parts)
         cascade.add(number, level)
         own = self.settings.for_level(number, transferred=level.coarse is not None)
-        fitted = self._fit(objective, own, level_name(self.settings, number), seed)
+        fitted = self.fit(objective, own, level_name(self.settings, number), seed)
         mix_in(level, objective, own.regression, self.campaign.parameters.shape[1], len(self.campaign.time), seed)
+        level.settle()
         return fitted
 
     def unified(self, surrogate: Surrogate, numbers: tuple[int, ...], scaling: InputScaling) -> Fit:
         """Train levels `numbers` together, and put them on `surrogate`."""
         finest, graphs = numbers[-1], self.graphs
-        seed = self._seeded(finest)
+        seed = self.seeded(finest)
         network = surrogate.core = Unified(scaling, self.settings, graphs, numbers)
         runs = self.runs(finest, graphs)
         states, held = (runs.samples(part) for part in self._parts)
         network.scale = _divide_by_rms(states, held)
         start_unified(network, lambda: map(as_states, states.split(CHUNK)))
         network.to(self.device)
-        inputs, held_inputs = (self._inputs(network.inputs, part) for part in self._parts)
+        inputs, held_inputs = (self.inputs(network.inputs, part) for part in self._parts)
         training, validation = (
             self._with_initial(Samples(x.to(self.device), y), len(part))
             if network.with_initial
@@ -73,64 +78,130 @@ class Trainer:
             for x, y, part in zip((states, held), (inputs, held_inputs), self._parts, strict=True)
         )
         objective = UnifiedObjective(network, training, validation)
-        return self._fit(objective, self.settings.for_level(finest), "MH", seed)
+        return self.fit(objective, self.settings.for_level(finest), "MH", seed)
 
-    def runs(self, number: int, graphs: Graphs) -> LevelRuns:
+    @property
+    def judged_campaign(self) -> Campaign:
+        """The runs that errors are measured on."""
+        return self.campaign
+
+    def judged(self, number: int, graphs: Graphs) -> LevelRuns:
+        """As `runs`, of the campaign that errors are measured on."""
+        return self.runs(number, graphs, self.judged_campaign)
+
+    def runs(self, number: int, graphs: Graphs, campaign: Campaign | None = None) -> LevelRuns:
         """The displacements of level `number` of `graphs`, which may hold fewer nodes than the hierarchy's level."""
         of_hierarchy, wanted = self.graphs.kept(number), graphs.kept(number)
         nodes = None if len(wanted) == len(of_hierarchy) else np.searchsorted(of_hierarchy, wanted)
-        return LevelRuns(self.campaign, number, self.settings, self.notes, nodes)
+        return LevelRuns(campaign or self.campaign, number, self.settings, self.notes, nodes)
 
     @property
     def _parts(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         return self.split.training, self.split.validation
 
-    def _seeded(self, number: int) -> int:
+    def seeded(self, number: int) -> int:
+        """The seed of a level's training, which torch is given."""
         seed = self.settings.seed * 1000 + number
         set_up(seed, self.settings.precision)
         return seed
 
-    def _fit(self, objective: Objective, settings: LevelSettings, name: str, seed: int) -> Fit:
-        return fit(
+    def fit(self, objective: Objective, settings: LevelSettings, name: str, seed: int) -> Fit:
+        """Run the training loop."""
+        return run_epochs(
             objective, settings, name=name, seed=seed, precision=self.settings.precision,
             report=self.report, keeper=self.keeper,
         )  # fmt: skip
 
-    def _on_states(self, level: LevelNetwork, runs: LevelRuns, inputs: Tensor, held_inputs: Tensor) -> LevelObjective:
-        states, held = (runs.samples(part) for part in self._parts)
+    def on_states(
+        self,
+        level: LevelNetwork,
+        runs: LevelRuns,
+        scaling: InputScaling,
+        training: NDArray[np.int64],
+        validation: NDArray[np.int64],
+        *,
+        alone: bool = False,
+    ) -> LevelObjective:
+        """The level on the states of the runs `training`, judged on those of `validation`; its linear part is started.
+
+        alone  the reduction is trained without the regression
+        """
+        states, held = (runs.samples(part) for part in (training, validation))
+        count = len(self.campaign.time)
+        first, course = states[::count].abs().max(), _course(states, count)
+        keep, keep_held = (self._known(part) for part in (training, validation))
+        if keep is not None and keep_held is not None:
+            states, held = states[keep], held[keep_held]
         level.scale = _divide_by_rms(states, held)
+        self._rest(level, scaling, first / level.scale, states.abs().max(), course)
         linear = linear_part(level.reduction)
         if linear is not None:
             start_level(level, linear, lambda: map(as_states, states.split(CHUNK)))
         level.to(self.device)
-        training = self._samples(level, states, inputs, len(self.split.training))
-        validation = self._samples(level, held, held_inputs, len(self.split.validation)) if len(held) else None
-        return LevelObjective(level, training, validation)
+        if alone:
+            level.regressor.requires_grad_(False)
+        inputs, held_inputs = (self.inputs(scaling, part) for part in (training, validation))
+        if keep is not None and keep_held is not None:
+            inputs, held_inputs = inputs[keep.to(inputs.device)], held_inputs[keep_held.to(inputs.device)]
+        samples = self._samples(level, states, inputs, len(training))
+        held_samples = self._samples(level, held, held_inputs, len(validation)) if len(held) else None
+        return LevelObjective(level, samples, held_samples, reduction_alone=alone)
 
-    def _on_coefficients(
-        self, level: LevelNetwork, runs: LevelRuns, inputs: Tensor, held_inputs: Tensor
-    ) -> LatentObjective:
-        """POD on fields that stay where they are but for one run; training then sees coefficients alone."""
-        squares: list[float] = []
+    def _known(self, runs: NDArray[np.int64]) -> Tensor | None:
+        """(run * state,) states that were computed, where not all were."""
+        known = self.campaign.known
+        return None if known is None else torch.from_numpy(np.asarray(known)[runs].ravel())
+
+    def _rest(self, level: LevelNetwork, scaling: InputScaling, first: Tensor, largest: Tensor, course: Tensor) -> None:
+        """Where all runs start undeformed, as their `first` displacements say, predictions will.
+
+        course  (state,) RMS displacement over the runs: before training, how far they have come apart
+        """
+        if self.settings.level.first_state == "kept" and first <= UNDEFORMED * largest:
+            level.at_rest = True
+            time = self.inputs(scaling, np.zeros(1, np.int64))[:, scaling.time_column].cpu()
+            level.course = Course.of(time, torch.zeros(len(time), level.latent), course)
+
+    def start_fixed(
+        self, level: LevelNetwork, runs: LevelRuns, scaling: InputScaling, training: NDArray[np.int64]
+    ) -> None:
+        """POD of the runs `training`, one at a time, as the reduction of a level that is not trained further."""
+        squares: list[Tensor] = []
+        first = largest = torch.zeros(())
 
         def fields() -> Iterator[Tensor]:
-            for run in self.split.training:
-                values = runs.read(run)
-                squares.append(float(np.square(values, dtype=np.float64).mean()))
-                yield torch.from_numpy(values).transpose(0, 1)
+            nonlocal first, largest
+            for run in training:
+                values = torch.from_numpy(runs.read(run))
+                squares.append(values.double().square().mean(dim=(1, 2)))
+                first, largest = torch.maximum(first, values[0].abs().max()), torch.maximum(largest, values.abs().max())
+                yield values.transpose(0, 1)
 
         linear = level.reduction
         start = pod_start(fields(), level.latent, level.n_nodes)  # in metres
-        level.scale = scale_of(float(np.mean(squares)))
+        course = torch.stack(squares).mean(dim=0)
+        level.scale = scale_of(float(course.mean()))
+        self._rest(level, scaling, first, largest, course.sqrt().float())
         linear.start_at(LinearStart(start.encode * level.scale, start.decode / level.scale, start.offset))  # type: ignore[operator]
-        training, rest = self._projected(level, runs, self.split.training)
-        held, held_rest = self._projected(level, runs, self.split.validation)
+
+    def _on_coefficients(
+        self,
+        level: LevelNetwork,
+        runs: LevelRuns,
+        scaling: InputScaling,
+        training: NDArray[np.int64],
+        validation: NDArray[np.int64],
+    ) -> LatentObjective:
+        """POD on fields that stay where they are but for one run; training then sees coefficients alone."""
+        self.start_fixed(level, runs, scaling, training)
+        projected, rest = self._projected(level, runs, training)
+        held, held_rest = self._projected(level, runs, validation)
         level.to(self.device)
-        objective = LatentObjective(
-            level, Samples(training.to(self.device), inputs), Samples(held.to(self.device), held_inputs),
+        inputs, held_inputs = (self.inputs(scaling, part) for part in (training, validation))
+        return LatentObjective(
+            level, Samples(projected.to(self.device), inputs), Samples(held.to(self.device), held_inputs),
             rest.to(self.device), held_rest.to(self.device),
         )  # fmt: skip
-        return objective
 
     @torch.no_grad()
     def _samples(self, level: LevelNetwork, states: Tensor, inputs: Tensor, runs: int) -> Samples:
@@ -165,13 +236,18 @@ class Trainer:
             rest.append((x - level.decode(z[-1])).square().mean(dim=(0, 2)))
         return torch.cat(z)[:, None], torch.cat(rest)
 
-    def _inputs(self, scaling: InputScaling, runs: NDArray[np.int64]) -> Tensor:
+    def inputs(self, scaling: InputScaling, runs: NDArray[np.int64]) -> Tensor:
         """(run * state, inputs) on the device; computed in float64, which some devices lack."""
         count = len(self.campaign.time)
         at = torch.from_numpy(np.repeat(self.campaign.parameters[runs].astype(np.float64), count, axis=0))
         time = torch.from_numpy(np.tile(self.campaign.time.astype(np.float64), len(runs)))
         result: Tensor = scaling(at, time).to(self.device)
         return result
+
+
+def _course(states: Tensor, count: int) -> Tensor:
+    """(state,): RMS of states (sim * state, 3, node) over the runs."""
+    return torch.stack([states[k::count].square().mean() for k in range(count)]).sqrt()
 
 
 def _divide_by_rms(states: Tensor, held: Tensor) -> float:

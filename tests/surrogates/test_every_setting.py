@@ -29,6 +29,7 @@ from surrogates.training.train import train_surrogate
 SMALL = {
     "mh": (
         "levels=[2,1]", "level.epochs=2", "level.batch=16", "level.latent=3", "level.channels=[4,5]", "level.start=plain",
+        "level.mlp.members=1", "level.patience=0", "level.first_state=learned",
         "level.mlp.widths=[8]", "level.mlp.activation=elu", "level.regression=network", "level.schedule=constant",
         "level.weight_decay=0", "level.rate_inputs=0", "level.learning_rate=0.01", "transfer.upsampling=static",
         "transfer.mlp=input", "transfer.epochs=1", "validation.share=0.3", "inputs.derived=off", "physics.clock=off",
@@ -66,6 +67,9 @@ TABLE: dict[str, list[Line]] = {
     "level.start": [line("level.start=pod")],
     "level.mlp.widths": [line("level.mlp.widths=[6, 6]")],
     "level.mlp.activation": [line(f"level.mlp.activation={a}") for a in ("gelu", "silu", "tanh")],
+    "level.mlp.members": [line("level.mlp.members=2", given=("level.regression=mean",))],
+    "level.patience": [line("level.patience=1", on=NONE)],
+    "level.first_state": [line("level.first_state=kept")],
     "level.regression": [line("level.regression=process"), line("level.regression=mean"), line("level.regression=auto")],
     "level.epochs": [line("level.epochs=3")],
     "level.batch": [line("level.batch=8")],

@@ -132,4 +132,4 @@ def test_the_documentation_names_every_setting() -> None:
 def test_settings_come_as_dictionaries_too(overrides: object) -> None:
     shared = {"transfer": {"encoder": "concat"}}
     chosen = settings("mh", overrides=[overrides, shared])  # type: ignore[list-item]
-    assert (chosen.level.epochs, chosen.for_level(2).latent, chosen.for_level(1).latent) == (20, 3, 16)
+    assert (chosen.level.epochs, chosen.for_level(2).latent, chosen.for_level(1).latent) == (20, 3, 48)

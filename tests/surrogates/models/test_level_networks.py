@@ -174,6 +174,6 @@ def test_weights_of_another_shape_are_refused_by_name() -> None:
         level.load_own_state(tensors)
 
 
-def test_more_latent_numbers_than_displacements_are_refused() -> None:
-    with pytest.raises(SurrogateError, match="latent size 40 exceeds the 27 displacements of 9 nodes"):
-        two_levels("level.latent=40")
+def test_a_mesh_of_few_nodes_has_as_many_latent_numbers_as_displacements() -> None:
+    cascade, _ = two_levels("level.latent=40")
+    assert {number: cascade.latent(number) for number in cascade.numbers} == {2: 27, 1: 40}

@@ -56,11 +56,11 @@ def e2(surrogate: Surrogate, level: int, mu: np.ndarray) -> float:
     ids=lambda value: value if isinstance(value, str) else " ".join(value) or "default",
 )
 def test_every_model_learns_and_survives_storage(model: str, overrides: Sequence[str], tmp_path: Path) -> None:
-    surrogate = trained(model, *overrides)
+    surrogate = trained(model, "level.epochs=12", *overrides)
     mu = plate.parameters(2, seed=7)
     for name, level in surrogate.level_names.items():
         history = surrogate.history(level)
-        if len(history):  # levels trained together have one history, that of the finest
+        if len(history) and level == max(surrogate.level_names.values()):  # a finer level starts where it may stay
             assert history["total"][-1] < history["total"][0]
         predicted = surrogate.predict(mu, level=level)
         assert predicted.shape == (2, 7, surrogate.graphs.n_nodes(level), 3)
@@ -142,13 +142,23 @@ def test_ctrl_c_leaves_a_usable_model(tmp_path: Path) -> None:
 
 def test_divergence_names_the_level_and_hands_over_what_is_good() -> None:
     with pytest.raises(Diverged, match="MH2: the loss is not finite in epoch") as caught:
-        trained("mh", "at.2.learning_rate=1e30", "at.2.schedule=constant", "at.2.clip=0")
+        trained("mh", "level.regression=network", "at.2.learning_rate=1e30", "at.2.schedule=constant", "at.2.clip=0")
     assert caught.value.surrogate is None or np.isfinite(caught.value.surrogate.predict(plate.parameters(1)[0])).all()
 
 
-def test_a_finer_level_that_diverges_leaves_the_coarser_ones() -> None:
+def test_where_a_network_diverges_beside_a_process_the_process_is_used() -> None:
+    surrogate = trained("mh", "levels=[2]", "at.2.learning_rate=1e30", "at.2.schedule=constant", "at.2.clip=0")
+    assert any("MH2: the loss is not finite" in note and "process alone" in note for note in surrogate.record.notes)
+    assert surrogate.record.choice["MH2"].startswith("process (process ")
+    assert np.isfinite(surrogate.predict(plate.parameters(1)[0])).all()
+
+
+@pytest.mark.parametrize("regression", ["network", "mean"])
+def test_a_finer_level_that_diverges_leaves_the_coarser_ones(regression: str) -> None:
     with pytest.raises(Diverged, match="MH1") as caught:
-        trained("mh", "at.1.learning_rate=1e30", "at.1.schedule=constant", "at.1.clip=0")
+        trained(
+            "mh", f"level.regression={regression}", "at.1.learning_rate=1e30", "at.1.schedule=constant", "at.1.clip=0"
+        )
     left = caught.value.surrogate
     assert left is not None
     assert 2 in left.level_names.values()
@@ -196,7 +206,7 @@ def test_one_training_run_is_a_noted_constant(model: str) -> None:
     assert any("one training run" in note for note in surrogate.record.notes)
     far = plate.parameters(2, seed=8)
     answers = surrogate.predict(far)
-    np.testing.assert_array_equal(answers[0], answers[1])
+    np.testing.assert_allclose(answers[0], answers[1], atol=1e-6 * np.abs(answers).max())
 
 
 def test_a_run_that_does_not_move_is_noted_and_learnt() -> None:

@@ -33,13 +33,13 @@ def test_onnxruntime_predicts_as_the_surrogate_does(
     surrogate: Surrogate, tmp_path: Path, level: int, full: bool
 ) -> None:
     path = tmp_path / "model.onnx"
-    assert export(surrogate, path, level, full=full) <= 1e-5
+    assert export(surrogate, path, level, full=full) <= 1e-4
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     mu, time = questions()
     found = session.run(None, {"parameters": mu, "time": time})[0]
     ask = surrogate.predict_full if full else surrogate.predict
     expected = np.stack([ask(p, [t], level)[0] for p, t in zip(mu, time, strict=True)])
-    np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
+    np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
 
 
 def test_a_torch_program_predicts_as_the_surrogate_does(surrogate: Surrogate, tmp_path: Path) -> None:
@@ -48,7 +48,7 @@ def test_a_torch_program_predicts_as_the_surrogate_does(surrogate: Surrogate, tm
     mu, time = questions()
     found = torch.export.load(path).module()(torch.from_numpy(mu), torch.from_numpy(time)).detach().numpy()
     expected = np.stack([surrogate.predict(p, [t])[0] for p, t in zip(mu, time, strict=True)])
-    np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
+    np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
 
 
 def test_exporting_leaves_the_surrogate_as_it_was(surrogate: Surrogate, tmp_path: Path) -> None:

@@ -186,12 +186,14 @@ def test_a_device_that_is_not_there_is_refused() -> None:
         device_of("tpu")
 
 
-@pytest.mark.parametrize("model", ["mh", "podnn"])
+@pytest.mark.parametrize("model", ["mh", "aenn"])
 def test_the_error_told_is_the_distance_of_validation_nodes_in_metres(model: str) -> None:
     told: list[Epoch] = []
     campaign = plate.campaign(10)
     surrogate = train_surrogate(
-        campaign, settings(model, overrides=["level.epochs=1", "level.regression=network"]), report=told.append
+        campaign,
+        settings(model, overrides=["level.epochs=1", "level.regression=network", "level.hidden=[9]"]),
+        report=told.append,
     )
     validation = [campaign.runs.index(name) for name in surrogate.record.validation_runs]
     for epoch, number in zip(told, surrogate.level_names.values(), strict=True):

@@ -1,0 +1,262 @@
+"""The regression of one level, chosen by cross-validation on its encoded training runs.
+
+Encoding is done once; after that a run is a course of a few latent numbers, and a network or a Gaussian process on them
+costs little. So networks are trained for every part of the runs that is left out in turn, and for all runs, side by side
+in one pass. What they and the processes say of left-out runs chooses the epoch and the mixture; the networks and the
+process of all runs, which are kept, need no training of their own afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from surrogates.models.level import LevelNetwork
+from surrogates.record import Fit
+from surrogates.regression.latent_process import LatentProcess, Wish, fit_process
+from surrogates.regression.network import Course, Regressor, Team
+from surrogates.training.loop import Diverged, Objective
+
+# Shares of the process to choose from.
+SHARES: Mapping[Wish, tuple[float, ...]] = {
+    "network": (0.0,), "process": (1.0,), "mean": (0.5,), "auto": (0.0, 0.25, 0.5, 0.75, 1.0),
+}  # fmt: skip
+
+
+def named(share: float) -> str:
+    """What a share of the process is called."""
+    return {0.0: "network", 1.0: "process"}.get(share, f"{100 * share:g} % process")
+
+
+@dataclass(frozen=True)
+class Latents:
+    """Encoded training runs of one level; the first `own` are runs as computed, the others their images.
+
+    inputs   (run, state, input) scaled, `time_column` the place of the time
+    values   (run, state, latent)
+    known    (run, state) states that count
+    sizes    (latent,) RMS movement of the nodes for a latent number that moves by one, in the level's unit
+    lost     mean square of what decoding does not give back, in the level's unit
+    part     (run,) the fold that leaves a run out, the same for a run and its image; folds count from 0
+    below    (fold + 1, run, state, coarse latent) what the coarse level's regressions say, those of all runs last
+    """
+
+    inputs: Tensor
+    values: Tensor
+    known: Tensor
+    sizes: Tensor
+    lost: float
+    part: Tensor
+    own: int
+    time_column: int
+    below: Tensor | None = None
+
+    @property
+    def folds(self) -> int:
+        return int(self.part.max()) + 1
+
+    @property
+    def time(self) -> Tensor:
+        """(state,) scaled."""
+        return self.inputs[0, :, self.time_column]
+
+    def wrong(self, z: Tensor) -> Tensor:
+        """(run, state) mean square error of displacements for latent vectors `z` of the own runs."""
+        return (z - self.values[: self.own]).square() @ self.sizes.square()
+
+
+@dataclass
+class Chosen:
+    """What became of the choice.
+
+    said      (fold + 1, run, state, latent) latent vectors by the regressions without each part of the runs, and of all
+    errors    RMS distance of nodes, m, on left-out runs by what was tried, such as "network" or "process 0.75"
+    """
+
+    said: Tensor
+    share: float
+    fit: Fit
+    errors: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    reduction_epochs: int = 0
+
+    @property
+    def told(self) -> str:
+        """The mixture in words."""
+        return named(self.share)
+
+    def left_out(self, latents: Latents) -> Tensor:
+        """(run, state, latent) of the own runs, each by the regression without it."""
+        own = torch.arange(latents.own, device=self.said.device)
+        return self.said[latents.part[: latents.own], own]
+
+
+class FoldedNetworks(Objective):
+    """Networks for each fold and for all runs, trained side by side; validation is on what each fold left out."""
+
+    def __init__(self, regressor: Regressor, course: Course, latents: Latents, scale: float) -> None:
+        super().__init__()
+        self.latents, self.unit = latents, scale
+        self.members, self.residual = regressor.members, regressor.residual
+        self.regressor: Team = regressor.team(self.members * (latents.folds + 1)).to(latents.values.device)
+        if self.residual:
+            self.regressor.end_at_zero()
+        self.mean, self.growth = course(latents.time)
+        places = latents.known.nonzero()
+        self.run, self.state = places[:, 0], places[:, 1]
+        self.size = len(places)
+        fold = torch.arange(latents.folds + 1, device=places.device).repeat_interleave(self.members)
+        self.trains = (fold[:, None] != latents.part[None]).float()
+
+    @property
+    def scale(self) -> float:
+        return self.unit
+
+    def networks(self) -> dict[str, nn.Module]:
+        return {"regressor": self.regressor}
+
+    def forward(self, index: Tensor) -> Tensor:
+        run, state = self.run[index], self.state[index]
+        wrong = (self._said(run, state) - self.latents.values[run, state]).square() @ self.latents.sizes.square()
+        trains = self.trains[:, run]
+        lost = self.latents.lost
+        return torch.stack([(wrong * trains).sum() / trains.sum() + lost, wrong.new_tensor(lost)])
+
+    def validation(self) -> Tensor | None:
+        latents = self.latents
+        own = torch.arange(len(latents.part), device=latents.part.device) < latents.own
+        total, count = latents.values.new_zeros(()), 0
+        for fold in range(latents.folds):
+            held = (own & (latents.part == fold)).nonzero()[:, 0]
+            known = latents.known[held]
+            wrong = (self.said(fold, held) - latents.values[held]).square() @ latents.sizes.square()
+            total, count = total + wrong[known].sum(), count + int(known.sum())
+        left = total / max(count, 1) + latents.lost
+        return torch.stack([left, left.new_tensor(latents.lost)])
+
+    @torch.no_grad()
+    def said(self, fold: int, runs: Tensor) -> Tensor:
+        """(run, state, latent) by the networks without `fold`, or by those of all runs for the fold behind the last."""
+        states = self.latents.values.shape[1]
+        some = slice(fold * self.members, (fold + 1) * self.members)
+        run = runs.repeat_interleave(states)
+        state = torch.arange(states, device=runs.device).repeat(len(runs))
+        said: Tensor = self._said(run, state, some, slice(fold, fold + 1)).mean(dim=0).unflatten(0, (len(runs), states))
+        return said
+
+    def _said(self, run: Tensor, state: Tensor, some: slice = slice(None), folds: slice = slice(None)) -> Tensor:
+        """(network, sample, latent) at samples of the runs and states given."""
+        x = self.latents.inputs[run, state][None]
+        below = self.latents.below
+        if below is not None:
+            coarse = below[folds][:, run, state].repeat_interleave(self.members, dim=0)
+            x = torch.cat([x.expand(len(coarse), -1, -1), coarse], dim=2)
+        out = torch.addcmul(self.mean[state], self.growth[state], self.regressor(x, some))
+        if below is None or not self.residual:
+            return out
+        return out + nn.functional.pad(coarse, (0, out.shape[2] - coarse.shape[2]))
+
+
+def course_of(latents: Latents, *, residual: bool, at_rest: bool) -> Course:
+    """The mean course of the training runs, or of what they add to the coarse level's; growth 1 unless `at_rest`."""
+    values = latents.values
+    if residual and latents.below is not None:
+        coarse = latents.below[-1]
+        values = values - nn.functional.pad(coarse, (0, values.shape[2] - coarse.shape[2]))
+    mean = values.mean(dim=0)
+    spread = ((values - mean).square() @ latents.sizes.square()).mean(dim=0).sqrt()
+    return Course.of(latents.time, mean, spread if at_rest else torch.ones_like(spread))
+
+
+def choose_regression(
+    level: LevelNetwork,
+    latents: Latents,
+    wish: Wish,
+    train: Callable[[Objective], Fit],
+    seed: int,
+    mixed: Sequence[int] = (),
+) -> Chosen:
+    """Train and choose the regression of `level`, and put it in place.
+
+    train  runs the training loop on an objective
+    mixed  parameters whose lengths form a full matrix, see `regression.gaussian.Gaussian`
+    """
+    regressor = level.regressor
+    course = course_of(latents, residual=regressor.residual, at_rest=level.at_rest).to(latents.values.device)
+    shares = SHARES[wish]
+    notes: list[str] = []
+    networks: Tensor | None = None
+    fitted = Fit()
+    if shares != (1.0,):
+        objective = FoldedNetworks(regressor, course, latents, level.scale)
+        try:
+            fitted = train(objective)
+        except Diverged as error:
+            if wish != "auto":
+                error.fit = None  # the level has no regression yet
+                raise
+            fitted, shares = error.fit or Fit(status="diverged"), (1.0,)
+            notes.append(f"{error}; the process alone is used")
+        else:
+            everyone = torch.arange(len(latents.part), device=latents.part.device)
+            networks = torch.stack([objective.said(fold, everyone) for fold in range(latents.folds + 1)])
+            regressor.take(objective.regressor, latents.folds * regressor.members)
+    processes, process = _processes(latents, shares, seed, mixed)
+    if processes is None:
+        shares = (0.0,)
+    said, errors = {}, {}
+    for share in shares:
+        said[share] = _mixed(networks, processes, share)
+        errors[share] = level.scale * _error(Chosen(said[share], share, fitted).left_out(latents), latents)
+    best = min(errors, key=lambda share: errors[share])
+    level.course = course if best < 1 else None
+    level.process = process if best > 0 else None
+    if level.process is not None:
+        level.process.share.fill_(best)
+    return Chosen(said[best], best, fitted, {named(share): error for share, error in errors.items()}, notes)
+
+
+def left_out_by_process(latents: Latents, seed: int, mixed: Sequence[int] = ()) -> Tensor | None:
+    """(run, state, latent) of the own runs, each by a process without it; None where runs do not differ."""
+    said, _ = _processes(latents, (1.0,), seed, mixed)
+    return None if said is None else Chosen(said, 1.0, Fit()).left_out(latents)
+
+
+def _error(z: Tensor, latents: Latents) -> float:
+    """RMS distance of nodes, in the level's unit, averaged over the known states of the own runs."""
+    known = latents.known[: latents.own]
+    return float((3.0 * (latents.wrong(z) + latents.lost)).sqrt()[known].mean())
+
+
+def _mixed(networks: Tensor | None, processes: Tensor | None, share: float) -> Tensor:
+    if processes is None or share == 0:
+        assert networks is not None
+        return networks
+    return processes if networks is None or share == 1 else torch.lerp(networks, processes, share)
+
+
+def _processes(
+    latents: Latents, shares: Sequence[float], seed: int, mixed: Sequence[int]
+) -> tuple[Tensor | None, LatentProcess | None]:
+    """What processes without each fold, and of all runs, say (fold + 1, run, state, latent); and the one of all runs."""
+    if shares == (0.0,):
+        return None, None
+    parameters = latents.inputs[:, 0, : latents.time_column].double().cpu().numpy()
+    if not np.ptp(parameters, axis=0).any():
+        return None, None
+    time, sizes = latents.time.double().cpu().numpy(), latents.sizes.double().cpu().numpy()
+    values, part = latents.values.double().cpu().numpy(), latents.part.cpu().numpy()
+    out = torch.empty(latents.folds + 1, *values.shape, device=latents.values.device)
+    process: LatentProcess | None = None
+    for fold in range(latents.folds + 1):
+        train: NDArray[np.bool_] = part != fold
+        process = fit_process(parameters[train], time, values[train], sizes, seed, mixed).to(out.device)
+        with torch.no_grad():
+            for run in range(len(values)):
+                out[fold, run] = process(latents.inputs[run])
+    return out, process
