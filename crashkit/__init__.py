@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from crashkit.errors import MeshError as MeshError
     from crashkit.errors import OutputError as OutputError
     from crashkit.errors import ReadError as ReadError
+    from crashkit.ingestion.arrays import from_arrays as from_arrays
     from crashkit.ingestion.ingest import IngestSummary as IngestSummary
     from crashkit.ingestion.ingest import ingest as ingest
     from crashkit.mesh.levels import Hierarchy as Hierarchy
@@ -55,6 +56,7 @@ _LAZY = {
     "coarsen": "crashkit.api.coarsen",
     "demo_data": "crashkit.dataset",
     "evaluate": "crashkit.api.evaluate",
+    "from_arrays": "crashkit.ingestion.arrays",
     "ingest": "crashkit.ingestion.ingest",
     "load_model": "crashkit.api.predict",
     "open_dataset": "crashkit.dataset",

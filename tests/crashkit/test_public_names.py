@@ -68,6 +68,7 @@ def test_looking_for_xarray_without_importing_it_does_not_lose_the_accessor() ->
 SNIPPET = """
 import crashkit
 reveal_type(crashkit.ingest)
+reveal_type(crashkit.from_arrays)
 reveal_type(crashkit.coarsen)
 reveal_type(crashkit.train)
 reveal_type(crashkit.evaluate)
