@@ -94,9 +94,9 @@ def show_result(output: Path) -> None:
     say("")
     table(
         "Mean node error on runs no model has seen, on the full mesh",
-        ("model", "error (cm)", "worst run (cm)", "POD floor (cm)"),
+        ("model", "error (cm)", "worst run (cm)", "best linear compression (cm)"),
         (
-            (r["model"], f"{r['error_cm']:.2f}", f"{r['worst_run_cm']:.2f}", f"{r['pod_floor_cm']:.2f}")
+            (r["model"], *(_centimetres(r[key]) for key in ("error_cm", "worst_run_cm", "pod_floor_cm")))
             for r in sorted(rows, key=lambda r: -float(r["error_cm"]))
         ),
     )
@@ -111,3 +111,8 @@ def show_result(output: Path) -> None:
         if path.exists():
             say(f"  {path}  {what}")
     what_next(None, ("info", output / "mh"), ("run", "study.yaml"))
+
+
+def _centimetres(value: float | None) -> str:
+    """A number of the report, which has none where a model keeps more modes than are looked at."""
+    return "-" if value is None else f"{value:.2f}"

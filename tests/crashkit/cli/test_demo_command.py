@@ -9,7 +9,7 @@ import pytest
 import typer
 
 from crashkit.cli._steps import Step, run_steps
-from crashkit.cli.demo import steps
+from crashkit.cli.demo import show_result, steps
 from crashkit.errors import OutputError
 
 
@@ -101,3 +101,14 @@ def test_every_command_of_the_demo_is_public(tmp_path: Path) -> None:
     used = {step.arguments[0] for step in steps(tmp_path, tmp_path / "source.h5")}
     assert used <= set(COMMANDS)
     assert {"ingest", "coarsen", "train", "evaluate", "predict"} <= used
+
+
+def test_a_model_without_a_best_linear_compression_is_shown_all_the_same(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "report").mkdir()
+    rows = [{"model": "POD-GPR", "error_cm": 1.649, "worst_run_cm": 8.113, "pod_floor_cm": None}]
+    (tmp_path / "report" / "report.json").write_text(json.dumps({"performance": rows}))
+    show_result(tmp_path)
+    (row,) = [line for line in capsys.readouterr().out.splitlines() if "POD-GPR" in line]
+    assert row.replace("│", " ").replace("|", " ").split()[1:] == ["1.65", "8.11", "-"]
