@@ -105,7 +105,7 @@ def _as_text(variable: xr.Variable) -> xr.Variable:
     """Text as numpy's own, which both forms on disk give in another way."""
     values = np.asarray(variable.values, object)
     text = np.array([str(value) for value in values.ravel()], dtype=str).reshape(values.shape)
-    return xr.Variable(variable.dims, text, variable.attrs)
+    return xr.Variable(variable.dims, text, variable.attrs, fastpath=True)  # without it xarray imports Dask to ask it
 
 
 def _one_line(error: BaseException) -> str:

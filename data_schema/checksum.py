@@ -79,7 +79,7 @@ def results(dataset: xr.Dataset) -> list[str]:
     return [n for n in ("displacement", "alive", "cell_alive", *fields(dataset)) if n in dataset.variables]
 
 
-def result_blocks(variable: xr.DataArray) -> Iterator[tuple[int, int, NDArray[Any]]]:
+def result_blocks(variable: xr.DataArray | xr.Variable) -> Iterator[tuple[int, int, NDArray[Any]]]:
     """(first, last, values (time, nodes, ...)) for one run's variable (time, node | face | cell, ...)."""
     entry = variable.dtype.itemsize * int(np.prod(variable.shape[2:], dtype=np.int64))
     for first, last in blocks(variable.shape[0], variable.shape[1], entry):

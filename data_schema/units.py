@@ -98,6 +98,15 @@ _SI_LABELS = frozenset(
     ("", "1", "m", "s", "kg", "m s-1", "m s-2", "N", "Pa", "J", "W", "N m", "N m-1", "m2", "m3", "kg m-3", "kg m-2",
      "kg m2", "s-1", "s-2", "rad", "rad s-1", "degree", "K", "degC", "degF", "%")
 )  # fmt: skip
+# What `_understood` finds for the usual ones, without half a second for pint; a test compares.
+_USUAL = MappingProxyType(
+    {
+        "mm": (0.001, "m"), "cm": (0.01, "m"), "km": (1000.0, "m"), "ms": (0.001, "s"), "g": (0.001, "kg"), "t": (1000.0, "kg"),
+        "m/s": (1.0, "m s-1"), "mm/ms": (1.0, "m s-1"), "mm/s": (0.001, "m s-1"), "km/h": (0.2777777777777778, "m s-1"),
+        "m/s2": (1.0, "m s-2"), "kPa": (1000.0, "Pa"), "MPa": (1000000.0, "Pa"), "GPa": (1000000000.0, "Pa"),
+        "N/mm2": (1000000.0, "Pa"), "kN": (1000.0, "N"), "kJ": (1000.0, "J"), "kg/m3": (1.0, "kg m-3"), "deg": (1.0, "degree"),
+    }
+)  # fmt: skip
 # (mass, length, time) -> label, where it is not made of kg, m and s alone.
 _DERIVED = MappingProxyType(
     {(1, 1, -2): "N", (1, -1, -2): "Pa", (1, 2, -2): "J", (1, 2, -3): "W", (1, 0, -2): "N m-1", (0, 0, 0): "1"}
@@ -153,7 +162,7 @@ def to_si(unit: str) -> tuple[float, str]:
         return 1.0, "1"
     if text in _SI_LABELS:
         return 1.0, text
-    found = _understood(text)
+    found = _USUAL.get(text) or _understood(text)
     if found is None:
         raise UnknownUnits(
             f"unit {text!r} is not known; write one such as m/s, km/h, mm, MPa, kg, degree, or none for a plain number"
@@ -164,7 +173,9 @@ def to_si(unit: str) -> tuple[float, str]:
 def is_unit(text: str) -> bool:
     """Whether `text` is a unit of mechanics; a lone "min" is not: it says minimum more often than minute."""
     text = " ".join(text.split())
-    return text.lower() != "min" and (text in _SI_LABELS or text == "-" or _understood(text) is not None)
+    return text.lower() != "min" and (
+        text in _SI_LABELS or text in _USUAL or text == "-" or _understood(text) is not None
+    )
 
 
 @cache

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from data_schema import UnknownUnits, si_unit, to_si, unit_system
-from data_schema.units import is_unit
+from data_schema.units import _USUAL, _understood, is_unit
 
 
 @pytest.mark.parametrize(
@@ -141,3 +141,8 @@ def test_a_system_keeps_its_name_and_the_si_values_of_its_units(name: str) -> No
 def test_units_of_mechanics_as_engineers_write_them(unit: str, factor: float, label: str) -> None:
     found, name = to_si(unit)
     assert (found, name) == (pytest.approx(factor, rel=1e-9), label)
+
+
+@pytest.mark.parametrize("unit", _USUAL)
+def test_usual_units_are_what_pint_makes_of_them(unit: str) -> None:
+    assert to_si(unit) == _understood(unit)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -48,3 +49,11 @@ def test_failure_is_one_line_and_code_one(tmp_path) -> None:
 
 def test_public_functions_stay_functions_after_their_modules_are_imported() -> None:
     assert _python("import crashkit, crashkit.ingestion; print(callable(crashkit.ingest))") == "True"
+
+
+def test_a_dataset_is_described_without_the_libraries_that_only_other_work_needs(demo_dataset: Path) -> None:
+    code = f"import sys, crashkit.cli as c; sys.argv = ['crashkit', 'info', '--json', {str(demo_dataset)!r}]; c.app(standalone_mode=False)"
+    loaded = _python(
+        code + "; print([m for m in ('dask.array', 'distributed', 'torch', 'vtkmodules') if m in sys.modules])"
+    )
+    assert loaded.endswith("[]")
