@@ -9,6 +9,20 @@ Facts = Mapping[str, object]
 Rows = Sequence[Sequence[object]]
 
 
+class Described:
+    """What says of itself the same as text and as HTML; dataclasses of this kind are made with `repr=False`."""
+
+    def _facts(self) -> tuple[str, Facts, Sequence[str], Rows]:
+        """Title, facts, names of columns and rows."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        return as_text(*self._facts())
+
+    def _repr_html_(self) -> str:
+        return as_html(*self._facts())
+
+
 def as_text(title: str, facts: Facts, columns: Sequence[str] = (), rows: Rows = ()) -> str:
     """A title, a line a fact, and the rows below their columns, aligned."""
     width = max(map(len, facts), default=0)

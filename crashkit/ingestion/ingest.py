@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from crashkit.display import Described, Facts, Rows, listed
 from crashkit.errors import CrashkitError, DataError, OutputError, ReadError
 from crashkit.ingestion.alignment import common_time, reach, same_time
 from crashkit.ingestion.assembly import Existing, publish
@@ -38,8 +39,8 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int, str], None]
 
 
-@dataclass(frozen=True)
-class IngestSummary:
+@dataclass(frozen=True, repr=False)
+class IngestSummary(Described):
     """What an ingest did.
 
     Attributes
@@ -75,6 +76,20 @@ class IngestSummary:
     states: int = 0
     scale: Scale | None = None
     question: str = ""
+
+    def _facts(self) -> tuple[str, Facts, Sequence[str], Rows]:
+        runs = {"added": self.added, "replaced": self.replaced, "unchanged": self.unchanged}
+        facts: dict[str, object] = {
+            "runs": len(self.runs),
+            **{what: f"{len(names)}: {listed(names)}" for what, names in runs.items() if names},
+            **{f"skipped {run}": why for run, why in self.skipped.items()},
+            "nodes": self.nodes,
+            "states": self.states,
+            **({"scale": self.scale} if self.scale is not None else {}),
+            **({"question": self.question} if self.question else {}),
+            **{f"note {k}": note for k, note in enumerate(self.notes, 1)},
+        }
+        return f"ingested into {self.output}", facts, (), ()
 
 
 def ingest(

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from crashkit.display import Described, Facts, Rows, listed
 from data_schema.pod import Pod, StreamedPod
 from evaluation.comparison.predictor import Model, Predictor
 from evaluation.comparison.reference import Reference
@@ -30,8 +31,8 @@ if TYPE_CHECKING:
 N_MODES = 50  # as many singular values as the paper shows
 
 
-@dataclass(frozen=True)
-class Evaluation:
+@dataclass(frozen=True, repr=False)
+class Evaluation(Described):
     """The comparison of `entries` on the test runs of `split`.
 
     Attributes
@@ -66,6 +67,17 @@ class Evaluation:
     context: Mapping[str, str] = field(default_factory=dict)
     sensors: Sensors | None = None
     files: tuple[Path, ...] = ()
+
+    def _facts(self) -> tuple[str, Facts, Sequence[str], Rows]:
+        rows = []
+        for entry in self.entries:
+            scores = self.scores[entry.label]
+            worst = int(np.argmax(scores.of_runs))
+            errors = (f"{100 * scores.mean:.2f}", f"{100 * scores.of_runs[worst]:.2f}")
+            rows.append((entry.label, entry.level, self.nodes(entry), *errors, self.test_names[worst]))
+        facts = {"test runs": listed(self.test_names), "mesh": f"{self.reference.n_nodes} nodes"}
+        columns = ("model", "level", "nodes", "mean node error (cm)", "worst run (cm)", "which")
+        return "evaluation on the full mesh", facts, columns, rows
 
     @property
     def test_names(self) -> tuple[str, ...]:

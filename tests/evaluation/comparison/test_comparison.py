@@ -90,3 +90,12 @@ def test_one_model_given_twice_is_refused(models):
 def test_no_model_is_an_error():
     with pytest.raises(EvaluationError, match="no model"):
         entries(())
+
+
+def test_an_evaluation_says_its_errors_and_worst_runs(evaluation) -> None:
+    rows = [line.split() for line in repr(evaluation).splitlines()[-len(evaluation.entries) :]]
+    for row, entry in zip(rows, evaluation.entries, strict=True):
+        of_runs = evaluation.scores[entry.label].of_runs
+        worst = evaluation.test_names[int(of_runs.argmax())]
+        assert row[-3:] == [f"{100 * of_runs.mean():.2f}", f"{100 * of_runs.max():.2f}", worst]
+        assert f"<td>{worst}</td>" in evaluation._repr_html_()
