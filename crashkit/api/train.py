@@ -133,6 +133,10 @@ def train(
             if report is not None:
                 report(epoch)
 
+        rescued = None if folder is None or not first else _rescued(folder, keeper.fingerprint, overwrite)
+        if rescued is not None:
+            keeper.discard()
+            return Model(rescued, folder)
         try:
             surrogate = train_surrogate(campaign, chosen, device=device, report=tell, keeper=keeper)
         except SurrogateError as error:
@@ -142,10 +146,61 @@ def train(
                 keeper.discard()
             raise
         if first and folder is not None:
-            save(surrogate, folder, overwrite=overwrite)
+            _store(surrogate, folder, keeper.fingerprint, overwrite)
             if not interrupted(surrogate):
                 keeper.discard()
     return Model(surrogate, folder)
+
+
+def _spare(folder: Path, fingerprint: str) -> Path:
+    """Where a model is kept that could not be stored as `folder`: the same place for the same training."""
+    import hashlib
+
+    place = hashlib.sha256(str(folder.absolute()).encode()).hexdigest()[:12]
+    return Path(tempfile.gettempdir()) / f"crashkit-kept-{fingerprint}-{place}"
+
+
+def _store(surrogate: Surrogate, folder: Path, fingerprint: str, overwrite: bool) -> None:
+    """Store the trained model; where the disk refuses, keep it elsewhere, so that the hours are not lost.
+
+    Raises OutputError that names the place and what to do.
+    """
+    from crashkit.errors import OutputError
+    from surrogates.errors import ModelFolderError
+    from surrogates.storage.folder import save
+
+    try:
+        save(surrogate, folder, overwrite=overwrite)
+    except ModelFolderError as error:
+        spare = _spare(folder, fingerprint)
+        try:
+            save(surrogate, spare, overwrite=True)
+        except ModelFolderError:
+            raise error from None
+        raise OutputError(
+            f"{error}. The trained model is kept in {spare}: once there is room, the same command stores it without training again"
+        ) from error
+
+
+def _rescued(folder: Path, fingerprint: str, overwrite: bool) -> Surrogate | None:
+    """The model that an earlier start of the same training could not store, now stored as `folder`; None without one."""
+    import os
+    import shutil
+
+    from surrogates.errors import ModelFolderError
+    from surrogates.storage.folder import load, save
+
+    spare = _spare(folder, fingerprint)
+    if not spare.is_dir() or (hasattr(os, "getuid") and spare.stat().st_uid != os.getuid()):
+        return None
+    try:
+        surrogate = load(spare)
+    except ModelFolderError:
+        return None
+    save(surrogate, folder, overwrite=overwrite)
+    shutil.rmtree(spare, ignore_errors=True)
+    surrogate.record.notes.append("was trained by an earlier start, which could not store it")
+    return surrogate
 
 
 def interrupted(surrogate: Surrogate) -> bool:

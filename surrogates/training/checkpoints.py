@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import logging
 import shutil
 import time
 from pathlib import Path
@@ -18,6 +20,7 @@ from surrogates.data.campaign import Campaign
 from surrogates.errors import SurrogateError
 from surrogates.settings import Settings
 
+_log = logging.getLogger(__name__)
 _IDENTITY = "training.json"
 _SECONDS = 30.0
 
@@ -42,6 +45,7 @@ class Checkpoints:
         self._last = time.monotonic()
         self._writes = _rank() == 0
         identity = {"settings": settings.as_dict(), "data": campaign.checksum, "runs": list(campaign.runs)}
+        self.fingerprint = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]
         if resume:
             self._check(identity)
         elif self._writes:
@@ -68,9 +72,14 @@ class Checkpoints:
     def save(self, name: str, tensors: dict[str, Tensor], about: dict[str, Any]) -> None:
         """Write level `name`; the file before stays until the new one is complete."""
         path = self._path(name)
-        with beside(path, durable=True) as new:
-            save_file({k: v.contiguous().cpu() for k, v in tensors.items()}, new, {"about": json.dumps(about)})
         self._last = time.monotonic()
+        try:
+            with beside(path, durable=True) as new:
+                save_file({k: v.contiguous().cpu() for k, v in tensors.items()}, new, {"about": json.dumps(about)})
+        except (OSError, SafetensorError) as error:  # a full disk costs the checkpoint, and not the training
+            _log.warning(
+                "%s: the state of the training cannot be written (%s); the training goes on without it", path, error
+            )
 
     def discard(self) -> None:
         """Forget everything: the training is finished and stored."""
