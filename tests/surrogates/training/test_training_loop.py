@@ -475,6 +475,49 @@ def test_a_training_that_was_finished_takes_no_step_and_gives_its_best_weights()
     assert done.epochs == SETTINGS.epochs
 
 
+# Patience
+
+
+BETTER_UNTIL_TWO = [3.0, 1.0, *[2.0] * 8]
+
+
+@pytest.mark.parametrize(
+    ("losses", "patience", "epochs"),
+    [
+        (BETTER_UNTIL_TWO, 0.3, 5),
+        (BETTER_UNTIL_TWO, 0.25, 5),  # a part of an epoch is a whole one
+        (BETTER_UNTIL_TWO, 0.1, 3),
+        ([1.0] * 10, 0.5, 6),  # the same is no better
+        ([3.0, 2.0, 2.0, 1.0, *[2.0] * 6], 0.3, 7),  # counted from the best one
+        (BETTER_UNTIL_TWO, 0.0, 10),
+        (BETTER_UNTIL_TWO, 1.0, 10),
+        ([float(10 - k) for k in range(10)], 0.1, 10),
+    ],
+)
+def test_a_training_ends_when_a_share_of_its_epochs_brought_nothing_on_runs_left_out(
+    losses: list[float], patience: float, epochs: int
+) -> None:
+    done = fit(Judged(losses), plain(epochs=10, patience=patience), name="x", seed=0)
+    assert done.epochs == len(done.history["total"]) == epochs
+    assert done.best_epoch == int(np.argmin(losses)) + 1
+
+
+def test_without_runs_left_out_patience_ends_nothing() -> None:
+    chosen = plain(epochs=10, patience=0.1, weight_approximation=0.0, weight_reconstruction=0.0)
+    done = fit(Recorder(), chosen, name="x", seed=0)
+    assert (done.epochs, done.best_epoch) == (10, 1)
+
+
+def test_a_training_that_patience_ended_is_kept_and_not_taken_up_again() -> None:
+    shelf, chosen = Shelf(), plain(epochs=10, patience=0.3)
+    done = fit(Judged(BETTER_UNTIL_TWO), chosen, name="MH1", seed=0, keeper=shelf)
+    assert [len(about["history"]["total"]) for _, about in shelf.saved] == [2, 4, 5]
+    again = Judged([])
+    resumed = fit(again, chosen, name="MH1", seed=0, keeper=Shelf(shelf.saved[-1]))
+    assert again.batches == []
+    assert (resumed.history, resumed.best_epoch) == (done.history, done.best_epoch)
+
+
 def test_ctrl_c_before_the_first_epoch_is_done_is_passed_on() -> None:
     class Pressed(Recorder):
         def forward(self, index: Tensor) -> Tensor:
