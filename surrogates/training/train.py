@@ -153,13 +153,6 @@ def _judge_by_folds(surrogate: Surrogate, trainer: Trainer, found: PodFit) -> No
             f"there is no band: it takes {FEWEST_BY_FOLDS} training runs, and there are {len(set(places))}"
         )
         return
-    record.left_out = {
-        record.fitted_runs[place]: (
-            float(np.mean([e for e, p in zip(errors, places, strict=True) if p == place])),
-            float(np.mean([d for d, p in zip(deviations, places, strict=True) if p == place])),
-        )
-        for place in sorted(set(places))
-    }
     sizes = found.registration.clock.size(trainer.campaign.parameters[runs[places]])
     surrogate.bands[0, False] = calibrate_gathered(
         gathered, record.time, Beliefs(sizes, np.array(deviations)), np.array(places)
