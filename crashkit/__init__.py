@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from crashkit.api.predict import predict as predict
     from crashkit.api.train import train as train
     from crashkit.api.validate import validate as validate
+    from crashkit.dataset import bumper_data as bumper_data
     from crashkit.dataset import demo_data as demo_data
     from crashkit.dataset import open_dataset as open_dataset
     from crashkit.errors import CrashkitError as CrashkitError
@@ -53,6 +54,7 @@ _LAZY = {
     "ReadError": "crashkit.errors",
     "SurrogateError": "surrogates.errors",
     "Violation": "data_schema",
+    "bumper_data": "crashkit.dataset",
     "coarsen": "crashkit.api.coarsen",
     "demo_data": "crashkit.dataset",
     "evaluate": "crashkit.api.evaluate",

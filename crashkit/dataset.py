@@ -127,3 +127,12 @@ def dataset_checksum(dataset: str | Path | xr.Dataset) -> str:
 def demo_data() -> Path:
     """The embedded campaign: 36 kart crashes in the HDF5 layout of the paper's public data."""
     return Path(__file__).parent / "data" / "kart_demo.h5"
+
+
+def bumper_data() -> Path:
+    """The embedded second structure: 30 impacts of a front-end module on a pole, in the same HDF5 layout.
+
+    Seven parts that share nodes, quads and triangles, five parameters, elements that fail (`alive`), plastic strain and
+    time histories. 26 runs for training (the campaign's numbers below 96), then 4 for testing: 98, 104, 106 and 118.
+    """
+    return Path(__file__).parent / "data" / "bumper_demo.h5"

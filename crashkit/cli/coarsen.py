@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -112,6 +113,21 @@ def show(path: Path, levels: list[dict[str, Any]]) -> None:
             for row in levels
         ),
     )
+    parts = list(levels[0]["lifting_error_of_parts"]) if levels else []
+    if len(parts) > 1:
+        table(
+            "Interpolation error by part: mean over the part's nodes (cm)",
+            ("part", *(f"level {row['level']}" for row in levels)),
+            (
+                (name, *(f"{100 * row['lifting_error_of_parts'][name]:.3f}" for row in levels))
+                for name in sorted(parts, key=lambda name: _descending(levels[-1]["lifting_error_of_parts"][name]))
+            ),
+        )
+
+
+def _descending(error: float) -> float:
+    """Sorts the largest error first, and parts without faces (NaN) last."""
+    return math.inf if math.isnan(error) else -error
 
 
 def _write_levels(folder: Path, hierarchy: Hierarchy, mesh: MeshArrays) -> list[Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,17 +18,25 @@ _BUDGET = 32 << 20
 
 @dataclass(frozen=True)
 class LiftingError:
-    """|U D u - u|, m: mean over nodes, states and runs, and the largest value."""
+    """|U D u - u|, m: mean over nodes, states and runs, the largest value, and the mean over the nodes of each part."""
 
     mean: float
     largest: float
+    parts: tuple[float, ...] = ()
 
 
 class LiftingMeter:
-    """Adds up the lifting errors of all levels from blocks of displacements, so that runs can be streamed."""
+    """Adds up the lifting errors of all levels from blocks of displacements, so that runs can be streamed.
 
-    def __init__(self, hierarchy: Hierarchy) -> None:
-        self._levels = hierarchy.levels
+    Parameters
+    ----------
+    parts
+        Node numbers of each part; a node that two parts share counts in both.
+    """
+
+    def __init__(self, hierarchy: Hierarchy, parts: Sequence[NDArray[np.integer]] = ()) -> None:
+        self._levels, self._parts = hierarchy.levels, parts
+        self._of_nodes = np.zeros((2, len(self._levels), hierarchy.n_nodes))  # sums, and how many are in them
         self._sum = np.zeros(len(self._levels))
         self._count = np.zeros(len(self._levels))
         self._largest = np.zeros(len(self._levels))
@@ -39,6 +48,9 @@ class LiftingMeter:
             for k, level in enumerate(self._levels):
                 error = np.linalg.norm(lift(level.to_full, block[:, level.kept]) - block, axis=-1)
                 there = np.isfinite(error)
+                if len(self._parts):
+                    self._of_nodes[0, k] += np.where(there, error, 0).sum(axis=0, dtype=np.float64)
+                    self._of_nodes[1, k] += there.sum(axis=0)
                 self._sum[k] += error[there].sum(dtype=np.float64)
                 self._count[k] += there.sum()
                 self._largest[k] = max(self._largest[k], error[there].max(initial=0.0))
@@ -48,6 +60,11 @@ class LiftingMeter:
         """One for each level, level 1 first; NaN where nothing was added."""
         counts = np.where(self._count > 0, self._count, np.nan)
         return [
-            LiftingError(float(s / c), float(m) if c == c else float("nan"))
-            for s, c, m in zip(self._sum, counts, self._largest, strict=True)
+            LiftingError(float(s / c), float(m) if c == c else float("nan"), self._of_parts(k))
+            for k, (s, c, m) in enumerate(zip(self._sum, counts, self._largest, strict=True))
         ]
+
+    def _of_parts(self, level: int) -> tuple[float, ...]:
+        total, count = self._of_nodes[:, level]
+        sums = ((total[nodes].sum(), count[nodes].sum()) for nodes in self._parts)
+        return tuple(float(s / c) if c else float("nan") for s, c in sums)

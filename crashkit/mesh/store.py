@@ -150,10 +150,25 @@ def level_displacement(path: str | Path, level: int, runs: Sequence[int] | None 
     return out
 
 
-def summarize_hierarchy(path: str | Path) -> list[dict[str, float | int]]:
-    """For each level: level, nodes, faces, edges, mean and largest distance (m), mean and largest lifting error (m)."""
+def part_nodes(dataset: xr.Dataset) -> list[NDArray[np.int64]]:
+    """The nodes on the faces of each part, in the order of the dataset's parts; a shared node is in both."""
+    faces, part = dataset["face_nodes"].values, dataset["face_part"].values
+    found = (np.unique(faces[part == k]) for k in range(dataset.sizes["part"]))
+    return [nodes[nodes >= 0].astype(np.int64) for nodes in found]
+
+
+def summarize_hierarchy(path: str | Path) -> list[dict[str, Any]]:
+    """For each level: level, nodes, faces, edges, mean and largest distance (m), mean and largest lifting error (m).
+
+    `lifting_error_of_parts` is the mean by the name of the part, m; NaN for a part without faces, empty where the
+    hierarchy was made by a crashkit that did not tell parts apart.
+    """
     path = Path(path)
-    rows = []
+    with open_dataset(path, chunks=None) as dataset:
+        titles = [str(name) for name in dataset["part_name"].values] if "part_name" in dataset else []
+        numbers = dataset["part_id"].values.tolist() if "part_id" in dataset else []
+    parts = [t if titles.count(t) == 1 else f"{t} ({n})" for t, n in zip(titles, numbers, strict=True)]
+    rows: list[dict[str, Any]] = []
     for index in range(1, int(_about(path)["levels"]) + 1):
         with _open_level(path, index) as group:
             distance = group["distance"].values if "distance" in group else np.array([np.nan])
@@ -167,9 +182,16 @@ def summarize_hierarchy(path: str | Path) -> list[dict[str, float | int]]:
                     "distance_max": float(distance.max()),
                     "lifting_error_mean": float(group.attrs["lifting_error_mean"]),
                     "lifting_error_max": float(group.attrs["lifting_error_max"]),
+                    "lifting_error_of_parts": _by_part(parts, group.attrs.get("lifting_error_of_parts", ())),
                 }
             )
     return rows
+
+
+def _by_part(names: Sequence[str], values: Any) -> dict[str, float]:
+    """The errors with the parts' names; a single number comes back from a file without its list."""
+    errors = np.atleast_1d(np.asarray(values, np.float64)).tolist()
+    return dict(zip(names, errors, strict=True)) if len(errors) == len(names) else {}
 
 
 def mesh_checksum(dataset: xr.Dataset) -> str:
@@ -296,7 +318,7 @@ def _stream(
     progress: Callable[[int, int], None] | None,
 ) -> list[LiftingError]:
     """One pass over the fine field: the displacements of level 1 go out, lifting errors add up."""
-    meter = LiftingMeter(hierarchy)
+    meter = LiftingMeter(hierarchy, part_nodes(dataset))
     first = hierarchy.levels[0]
     runs, states = dataset.sizes["sim"], dataset.sizes["time"]
     write = target.stream(
@@ -324,6 +346,7 @@ def _write_level(target: _Target, level: Level, error: LiftingError) -> None:
             "lifting_error_mean": error.mean,
             "lifting_error_max": error.largest,
             "lifting_error_units": "m",
+            "lifting_error_of_parts": list(error.parts),
         },
     )
     target.array(group, "kept", ("level_node",), level.kept, {"long_name": "node of level 0"})

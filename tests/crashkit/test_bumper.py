@@ -1,0 +1,162 @@
+"""The embedded bumper through the whole way: parts that share nodes, failing elements, plastic strain, histories."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+from typer.testing import CliRunner
+
+import crashkit
+from crashkit.cli import app
+from crashkit.cli.coarsen import show
+from crashkit.mesh.store import summarize_hierarchy
+from crashkit.writers.paraview import read_state
+from evaluation.comparison.result import Evaluation
+
+PARTS = ("bumper_beam", "crash_box_left", "crash_box_right", "flange_plates", "rail_left", "rail_right", "rear_plate")
+# Places of training runs, several of which lose elements, and of two test runs that do.
+TRAIN, TEST = [*range(0, 16, 2), 21, 22], [26, 28]
+
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*outside the trained range:UserWarning")
+
+
+@pytest.fixture(scope="module")
+def bumper(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The embedded campaign as a dataset with two coarser meshes; not to be changed."""
+    output = tmp_path_factory.mktemp("bumper") / "bumper.zarr"
+    crashkit.ingest(crashkit.bumper_data(), output, fields=["plastic_strain"])
+    crashkit.coarsen(output, [200, 50])
+    return output
+
+
+@pytest.fixture(scope="module")
+def few(bumper: Path) -> xr.Dataset:
+    """Ten training and two test runs at every second state."""
+    return crashkit.open_dataset(bumper).isel(sim=[*TRAIN, *TEST], time=slice(None, None, 2))
+
+
+@pytest.fixture(scope="module")
+def models(few: xr.Dataset) -> tuple[crashkit.Model, crashkit.Model]:
+    """Both kinds of model, as they come: no setting says anything of elements that fail."""
+    test = [str(name) for name in few["sim"].values[-2:]]
+    return (
+        crashkit.train(few, model="pod-gpr", test=test),
+        crashkit.train(few, model="mh", test=test, epochs=2),
+    )
+
+
+@pytest.fixture(scope="module")
+def evaluation(few: xr.Dataset, models: tuple[crashkit.Model, crashkit.Model]) -> Evaluation:
+    return crashkit.evaluate(few, models)
+
+
+def test_it_is_small_enough_for_the_package() -> None:
+    assert crashkit.bumper_data().stat().st_size < 6 << 20
+
+
+def test_parts_numbers_and_life_come_in_as_they_are(bumper: Path) -> None:
+    dataset = crashkit.open_dataset(bumper, chunks=None)
+    with h5py.File(crashkit.bumper_data()) as file:
+        numbers, alive, part = file["run"][:], file["bumper/alive"][:] != 0, file["bumper/part"][:]
+        strain, force = file["bumper/plastic_strain"][:], file["history/wall_force_x"][:]
+        node_id, element_id = file["bumper/node_id"][:], file["bumper/element_id"][:]
+    assert tuple(dataset["part_name"].values) == PARTS
+    assert list(dataset["sim"].values) == [f"run_{number:03d}" for number in numbers]
+    np.testing.assert_array_equal(dataset["part_id"].values[dataset["face_part"].values], part)
+    np.testing.assert_array_equal(dataset["node_id"].values, node_id)
+    np.testing.assert_array_equal(dataset["face_id"].values, element_id)
+    np.testing.assert_array_equal(dataset["alive"].values, alive)
+    np.testing.assert_allclose(dataset["plastic_strain"].values, strain, atol=1e-6)
+    np.testing.assert_allclose(dataset["history"].sel(channel="wall_force_x").values, force, rtol=1e-6)
+    assert (~alive[:, -1]).any(axis=1).sum() >= 15
+
+
+def test_displacements_are_missing_exactly_where_no_living_element_holds_a_node(bumper: Path) -> None:
+    dataset = crashkit.open_dataset(bumper, chunks=None)
+    faces = dataset["face_nodes"].values
+    for run in (15, 24):
+        alive, u = dataset["alive"].values[run], dataset["displacement"].values[run]
+        for state in (0, 15):
+            held = np.unique(faces[alive[state]])
+            there = np.zeros(len(u[state]), bool)
+            there[held[held >= 0]] = True
+            np.testing.assert_array_equal(np.isfinite(u[state]).all(axis=1), there)
+
+
+def test_interpolation_errors_come_by_part_and_average_over_its_nodes(bumper: Path) -> None:
+    dataset = crashkit.open_dataset(bumper, chunks=None)
+    levels = summarize_hierarchy(bumper)
+    assert tuple(levels[0]["lifting_error_of_parts"]) == PARTS
+    u = dataset["displacement"].values
+    for row, level in zip(levels, crashkit.open_hierarchy(bumper).levels, strict=True):
+        lifted = np.stack([[level.to_full @ state for state in run] for run in u[:, :, level.kept]])
+        error = np.linalg.norm(lifted - u, axis=-1)
+        for k, name in enumerate(PARTS):
+            nodes = np.unique(dataset["face_nodes"].values[dataset["face_part"].values == k])
+            expected = np.nanmean(error[:, :, nodes[nodes >= 0]])
+            assert row["lifting_error_of_parts"][name] == pytest.approx(expected, rel=1e-4, abs=1e-7)
+
+
+def test_coarsen_prints_them(bumper: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    show(bumper, summarize_hierarchy(bumper))
+    printed = capsys.readouterr().out
+    assert "Interpolation error by part" in printed
+    assert all(name in printed for name in PARTS)
+
+
+def test_models_learn_from_what_is_left_without_a_setting(models: tuple[crashkit.Model, crashkit.Model]) -> None:
+    for model in models:
+        assert model.settings.missing == "auto"
+        errors = model.record.errors
+        assert errors
+        assert all(np.isfinite(error) for error in errors.values())
+
+
+def test_errors_count_what_is_there(
+    few: xr.Dataset, models: tuple[crashkit.Model, crashkit.Model], evaluation: Evaluation
+) -> None:
+    parameters = models[0].parameters
+    for place, run in enumerate((-2, -1)):
+        one = few.isel(sim=run).compute()
+        said = models[0].predict({name: float(one[name]) for name in parameters}, extrapolate=True)
+        error = np.linalg.norm(said["displacement"].values - one["displacement"].values, axis=-1)
+        assert np.isnan(error).any()
+        assert evaluation.scores["POD-GPR"].of_runs[place] == pytest.approx(np.nanmean(error, axis=1).mean(), rel=1e-4)
+    for scores in evaluation.scores.values():
+        for values in (scores.e2, scores.reconstruction, scores.largest, scores.relative, scores.groups["part"]):
+            assert np.isfinite(values).all()
+
+
+def test_errors_come_by_part(
+    few: xr.Dataset, models: tuple[crashkit.Model, crashkit.Model], evaluation: Evaluation
+) -> None:
+    assert evaluation.group_names["part"] == PARTS
+    one = few.isel(sim=-1).compute()
+    said = models[0].predict({name: float(one[name]) for name in models[0].parameters}, extrapolate=True)
+    error = np.linalg.norm(said["displacement"].values - one["displacement"].values, axis=-1)
+    for k in range(len(PARTS)):
+        nodes = np.unique(one["face_nodes"].values[one["face_part"].values == k])
+        expected = np.nanmean(error[:, nodes[nodes >= 0]], axis=1).mean()
+        assert evaluation.scores["POD-GPR"].groups["part"][0, 1, k] == pytest.approx(expected, rel=1e-4, abs=1e-6)
+
+
+def test_a_run_beside_its_truth_in_paraview_hides_what_has_failed(
+    bumper: Path, models: tuple[crashkit.Model, crashkit.Model], tmp_path: Path
+) -> None:
+    models[0].save(tmp_path / "gpr")
+    arguments = ["predict", str(tmp_path / "gpr"), "--run", "run_106", "--dataset", str(bumper)]
+    told = CliRunner().invoke(app, [*arguments, "-o", str(tmp_path / "run.pvd"), "--extrapolate", "--json"])
+    assert told.exit_code == 0, told.output
+    said = json.loads(told.output)
+    assert np.isfinite([said["mean_error_m"], said["largest_error_m"], said["relative_error"]]).all()
+    _, grid = read_state(tmp_path / "run.pvd")
+    dead = ~crashkit.open_dataset(bumper)["alive"].sel(sim="run_106").isel(time=-1).values
+    assert dead.sum() > 10
+    np.testing.assert_array_equal(np.asarray(grid.cell_data["vtkGhostType"]) != 0, dead)
+    assert np.isfinite(np.asarray(grid.points)).all()
