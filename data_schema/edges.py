@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import sparse
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 
 def face_edges(face_nodes: ArrayLike) -> NDArray[np.int32]:
@@ -32,6 +36,8 @@ def adjacency(n: int, edges: NDArray[np.integer]) -> sparse.csr_matrix:
     """Symmetric 0/1 matrix (n, n) of undirected edges (e, 2)."""
     i, j = edges.T
     ones = np.ones(2 * len(edges))
+    from scipy import sparse
+
     return sparse.csr_matrix((ones, (np.concatenate([i, j]), np.concatenate([j, i]))), shape=(n, n))
 
 

@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from crashkit.chunks import KEYS, codecs
 from crashkit.dataset import open_dataset, reading_dataset
@@ -34,6 +33,7 @@ from data_schema.replace import beside, put_in_place, room_beside
 
 if TYPE_CHECKING:
     import xarray as xr
+    from scipy import sparse
 from typing import TYPE_CHECKING
 
 import xarray as xr
@@ -372,6 +372,8 @@ def _write_level(target: _Target, level: Level, error: LiftingError) -> None:
 
 
 def _csr(group: xr.Dataset, name: str, rows: int, columns: int) -> sparse.csr_matrix:
+    from scipy import sparse
+
     matrix = sparse.csr_matrix(
         (group[f"{name}_data"].values, group[f"{name}_indices"].values, group[f"{name}_indptr"].values),
         shape=(rows, columns),
