@@ -130,6 +130,7 @@ _WORDS = MappingProxyType(
         "celsius": "degC", "lbm": "lb", "kp": "kgf", "sek": "s", "std": "h", "kmh": "kph", "kmph": "kph", "m/sec": "m/s",
         "mus": "us", "mps": "m/s", "'": "ft", "''": "in", '"': "in", "zoll": "in", "g0": "g_n", "gee": "g_n", "nm": "N*m",
         "knm": "kN*m", "nmm": "N*mm", "kn": "kN", "rev": "turn", "cal": "calorie",
+        "ips": "in/s", "g's": "G", "gs": "G", "kgs": "kg", "u/min": "rpm",
     }
 )  # fmt: skip
 # How units are spelled properly, for those written in capitals or small letters throughout.
@@ -141,8 +142,14 @@ _SPELLED = frozenset(
 _TOKEN = re.compile(r"(?P<word>[^\W\d_]+|°[CF]?|%|\"|'{1,2})(?:\^|\*\*)?(?P<power>[-+]?\d{1,2}(?!\d))?")
 # What may stand between the words of a unit; numbers may not, but for the 1 of 1/s.
 _BETWEEN = re.compile(r"[ */().1]*")
+# Feet and inches stand alone; two signs of division are none.
+_ODD = re.compile(r"\w['\"]|//")
 _LONGEST = 60
-_POWERS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻·⋅×µ", "0123456789-***μ")
+_POWERS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻−·⋅×µ∕⁄", "0123456789--***μ//")
+# A point between two words is a product ("kg.m-3"), as CF has it.
+_PRODUCT = re.compile(r"(?<=[^\W_])\.(?=[^\W\d_])")
+# Written without a space, a metre per second and one per millisecond look alike.
+_TWO_MEANINGS = re.compile(r"ms\s?(?:\^|\*\*)?\s?\(?-[12]\)?")
 
 
 def to_si(unit: str) -> tuple[float, str]:
@@ -162,6 +169,8 @@ def to_si(unit: str) -> tuple[float, str]:
         return 1.0, "1"
     if text in _SI_LABELS:
         return 1.0, text
+    if _TWO_MEANINGS.fullmatch(text.translate(_POWERS)):
+        raise UnknownUnits(f"unit {text!r} may be metres per second or one per millisecond; write m/s, m/s^2 or 1/ms")
     found = _USUAL.get(text) or _understood(text)
     if found is None:
         raise UnknownUnits(
@@ -183,13 +192,16 @@ def _understood(text: str) -> tuple[float, str] | None:
     """Factor and label of a unit, None where it is none of mechanics."""
     import pint
 
-    plain = text.translate(_POWERS).replace("°C", "degC").replace("°F", "degF")
+    plain = _PRODUCT.sub("*", text.translate(_POWERS)).replace("°C", "degC").replace("°F", "degF")
     if plain.lower() in _WORDS:
         plain = _WORDS[plain.lower()]
-    if len(plain) > _LONGEST or not _BETWEEN.fullmatch(_TOKEN.sub(" ", plain)):
+    if len(plain) > _LONGEST or not _BETWEEN.fullmatch(_TOKEN.sub(" ", plain)) or _ODD.search(plain):
         return None
     registry = _registry()
     try:
+        # A lone prefix is no unit, though pint reads over it.
+        if not all(registry.parse_unit_name(_spelled(m).split(")")[0][1:]) for m in _TOKEN.finditer(plain)):
+            return None
         spelled = _TOKEN.sub(_spelled, plain)
         units = registry.parse_units(spelled)
         if not units._units or any(name not in _MECHANICS for name in _names(units)):

@@ -146,3 +146,27 @@ def test_units_of_mechanics_as_engineers_write_them(unit: str, factor: float, la
 @pytest.mark.parametrize("unit", _USUAL)
 def test_usual_units_are_what_pint_makes_of_them(unit: str) -> None:
     assert to_si(unit) == _understood(unit)
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor", "label"),
+    [
+        ("m.s-1", 1.0, "m s-1"), ("kg.m-3", 1.0, "kg m-3"), ("m s−1", 1.0, "m s-1"), ("km∕h", 1 / 3.6, "m s-1"),
+        ("g's", 9.80665, "m s-2"), ("ips", 0.0254, "m s-1"), ("U/min", 2 * 3.14159265358979 / 60, "rad s-1"),
+    ],
+)  # fmt: skip
+def test_other_signs_for_products_quotients_and_powers(unit: str, factor: float, label: str) -> None:
+    found, name = to_si(unit)
+    assert (found, name) == (pytest.approx(factor, rel=1e-9), label)
+
+
+@pytest.mark.parametrize("unit", ["E+03 Pa", "m//s", "m'", 'N"', "k Pa"])
+def test_what_pint_reads_over_is_no_unit(unit: str) -> None:
+    with pytest.raises(UnknownUnits, match="is not known"):
+        to_si(unit)
+
+
+@pytest.mark.parametrize("unit", ["ms-1", "ms^-1", "ms⁻²", "ms -1"])
+def test_a_unit_of_two_meanings_is_refused_with_both(unit: str) -> None:
+    with pytest.raises(UnknownUnits, match="may be metres per second or one per millisecond; write m/s"):
+        to_si(unit)
