@@ -31,7 +31,7 @@ def command(
     ] = None,
     params: Annotated[
         Path | None,
-        typer.Option(help="Predict every row of this table (CSV, JSON or XLSX) instead.", show_default="none"),
+        typer.Option(help="Predict every row of this table (CSV, TSV, JSON or XLSX) instead.", show_default="none"),
     ] = None,
     run: Annotated[
         str, typer.Option(help="Predict this run of --dataset instead, with the truth beside it.", show_default="none")

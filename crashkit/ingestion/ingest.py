@@ -128,7 +128,7 @@ def ingest(
     output
         The dataset, `.zarr` or `.nc`. If it exists, new runs are added to it.
     params
-        Table of design parameters (CSV, JSON, XLSX); its values replace those of the source.
+        Table of design parameters (CSV, TSV, JSON, XLSX); its values replace those of the source.
     units
         Unit system of the source, such as "mm-ms-kg"; needed if the source does not say its units.
     reader

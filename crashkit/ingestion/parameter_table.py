@@ -1,4 +1,4 @@
-"""Design parameters from a table beside the runs: CSV, JSON or XLSX, one row a run.
+"""Design parameters from a table beside the runs: CSV, TSV, JSON or XLSX, one row a run.
 
 The column `run` names the run as the dataset does; every other column is a parameter, with its unit in brackets
 behind the name (`impact_speed [m/s]`), in a row of units below the header, or in a YAML file of the same name beside
@@ -11,9 +11,11 @@ empty column at the end, a comma as decimal mark or between thousands. Where it 
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import json
+import math
 import re
 import zipfile
 from collections import Counter
@@ -29,16 +31,25 @@ from data_schema.units import is_unit
 
 # The column with the names of the runs, the first that is there; the others are names for people.
 _KEYS = ("run", "sim", "name")
-SUFFIXES = (".csv", ".json", ".xlsx")
+SUFFIXES = (".csv", ".tsv", ".json", ".xlsx")
 # The header stands in one of the first rows: above it are titles.
 _TITLE_ROWS = 20
-_UNIT_ROWS = ("", "unit", "units", "einheit", "einheiten", "-", "[-]")
+_UNIT_ROWS = ("", "unit", "units", "einheit", "einheiten", "-")
 # A table of parameters is small; a workbook is packed and could be made to fill the memory.
 _MOST_BYTES = 64 << 20
 _PLAIN = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _DECIMAL_COMMA = re.compile(r"[-+]?(?:\d{1,3}(?:\.\d{3})+|\d*),\d+(?:[eE][-+]?\d+)?")
 _THOUSANDS = re.compile(r"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d*)?")
-_SPACES = re.compile(r"(?<=\d)[\u00a0\u202f' ](?=\d{3}(?:\D|$))")
+_SPACES = re.compile(r"(?<=\d)[\u00a0\u2009\u202f'\u2019 ](?=\d{3}(?:\D|$))")
+# 1.500 where the comma is the decimal mark: fifteen hundred to some, one and a half to others.
+_POINTS = re.compile(r"[-+]?[1-9]\d{0,2}(?:\.\d{3})+")
+
+
+_TOO_LARGE = 10**308
+
+
+class _Percent(float):
+    """A number of a cell that is shown in percent."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +106,11 @@ def read_parameter_table(path: Path) -> ParameterTable:
         Naming a run with two rows.
     """
     table = _load(path)
-    key = next((k for name in _KEYS for k, c in enumerate(table.header) if _plain(c) == name), None)
+    keys = next((found for name in _KEYS if (found := _called(table.header, name))), [])
+    if len(keys) > 1:
+        told = " and ".join(repr(table.header[k]) for k in keys)
+        raise ReadError(f"{path}: columns {told} could both name the runs; rename one of them")
+    key = keys[0] if keys else None
     if key is None:
         raise ReadError(
             f"{path}: no column called run; its columns are {', '.join(filter(None, table.header)) or 'none'}"
@@ -103,6 +118,11 @@ def read_parameter_table(path: Path) -> ParameterTable:
     chosen = [k for k, c in enumerate(table.header) if k != key and _plain(c) not in _KEYS]
     columns = parameter_columns([table.header[k] for k in chosen], [""] * len(chosen), str(path))
     body, below = _without_units_row(table, key, chosen)
+    for k, (name, unit) in zip(chosen, columns, strict=True):
+        if unit and below.get(k, unit) != unit:
+            raise ReadError(
+                f"{path}: {name} is in {unit} by its title and in {below[k]} by the row of units; leave one of them"
+            )
     beside = _units_beside(path)
     mark = _decimal_mark(body, chosen, path)
     rows: dict[str, dict[str, tuple[float, str]]] = {}
@@ -116,7 +136,8 @@ def read_parameter_table(path: Path) -> ParameterTable:
         values = {}
         for k, (name, unit) in zip(chosen, columns, strict=True):
             place = f"{path}: row {number} (run {run}), column {table.header[k]!r}"
-            values[name] = (_number(line[k], mark, place), unit or below.get(k, "") or beside.get(name, ""))
+            stated = unit or below.get(k, "") or beside.get(name, "")
+            values[name] = (_number(line[k], mark, place, percent=stated == "%"), stated)
         rows[run] = values
     if twice:
         raise DataError(f"{path}: more than one row for run {', '.join(dict.fromkeys(twice))}; keep one each")
@@ -141,7 +162,7 @@ def _load(path: Path) -> _Table:
         raise ReadError(f"{path}: a parameter table is {', '.join(SUFFIXES)}, not {suffix or 'without suffix'}")
     if path.stat().st_size > _MOST_BYTES:
         raise ReadError(f"{path}: has {path.stat().st_size >> 20} MB; expected a table with a row a run, below 64 MB")
-    read = {".json": _json_rows, ".xlsx": _workbook_rows, ".csv": _text_rows}[suffix]
+    read = {".json": _json_rows, ".xlsx": _workbook_rows, ".csv": _text_rows, ".tsv": _text_rows}[suffix]
     try:
         lines = read(path)
     except ReadError:
@@ -168,6 +189,11 @@ def _load(path: Path) -> _Table:
     if nameless is not None:
         raise ReadError(f"{path}: column {nameless + 1} has values and no name; name it in the header, or empty it")
     return _Table([header[k] for k in kept], [(number, [line[k] for k in kept]) for number, line in body])
+
+
+def _called(header: Sequence[str], name: str) -> list[int]:
+    """The columns whose title is `name`, whatever its capitals and signs."""
+    return [k for k, title in enumerate(header) if _plain(title) == name]
 
 
 def _plain(title: str) -> str:
@@ -207,16 +233,39 @@ def _decoded(content: bytes, path: Path) -> str:
 
 
 def _workbook_rows(path: Path) -> list[tuple[int, list[Any]]]:
-    import pandas as pd
-
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as packed:
             size = sum(entry.file_size for entry in packed.infolist())
         if size > 4 * _MOST_BYTES:
             raise ReadError(f"{path}: unpacks to {size >> 20} MB; expected a table with a row a run")
     need(f"reading {path}", "formats")
-    frame = pd.read_excel(path, header=None, dtype=object)
-    return [(number, list(row)) for number, row in enumerate(frame.itertuples(index=False), 1)]
+    import openpyxl
+
+    with contextlib.closing(openpyxl.load_workbook(path, read_only=True, data_only=True)) as book:
+        sheets = {sheet.title: _sheet_rows(sheet) for sheet in book.worksheets if sheet.sheet_state == "visible"}
+    with_runs = [
+        title
+        for title, lines in sheets.items()
+        if any(_plain(_text(cell)) in _KEYS for _, line in lines[:_TITLE_ROWS] for cell in line)
+    ]
+    if len(with_runs) > 1:
+        raise ReadError(
+            f"{path}: sheets {' and '.join(map(repr, with_runs))} both have a column of runs; keep one, or save it as CSV"
+        )
+    return sheets[with_runs[0]] if with_runs else next(iter(sheets.values()), [])
+
+
+def _sheet_rows(sheet: Any) -> list[tuple[int, list[Any]]]:
+    """The rows of a sheet that hold anything, numbers shown in percent as such; unsolved formulas are empty."""
+
+    def value(cell: Any) -> Any:
+        shown = isinstance(cell.value, (int, float)) and not isinstance(cell.value, bool)
+        return _Percent(cell.value) if shown and "%" in str(cell.number_format) else cell.value
+
+    # What a sheet says of its own size may be a million empty rows.
+    sheet.reset_dimensions()
+    rows = ((number, [value(cell) for cell in row]) for number, row in enumerate(sheet.iter_rows(), 1))
+    return [(number, row) for number, row in rows if any(cell is not None for cell in row)]
 
 
 def _json_rows(path: Path) -> list[tuple[int, list[Any]]]:
@@ -244,7 +293,11 @@ def _without_units_row(
     first = table.lines[0][1]
     cells = {k: _text(first[k]).strip("[]() ") for k in chosen}
     told = {k: text for k, text in cells.items() if text}
-    if _text(first[key]).lower() not in _UNIT_ROWS or not told or not all(is_unit(text) for text in told.values()):
+    if (
+        _text(first[key]).lower().strip("[]():") not in _UNIT_ROWS
+        or not told
+        or not all(is_unit(text) for text in told.values())
+    ):
         return table.lines, {}
     return table.lines[1:], {k: "" if text == "-" else text for k, text in told.items()}
 
@@ -257,7 +310,7 @@ def _decimal_mark(body: Sequence[tuple[int, list[Any]]], chosen: Sequence[int], 
     ReadError
         Where both would do ("350,000"), or cells contradict each other.
     """
-    cells = [(number, _SPACES.sub("", _text(line[k]))) for number, line in body for k in chosen]
+    cells = [(number, _SPACES.sub("", _text(line[k])).replace("\u2212", "-")) for number, line in body for k in chosen]
     with_comma = [(number, text) for number, text in cells if "," in text]
     decimal = [(n, t) for n, t in with_comma if _DECIMAL_COMMA.fullmatch(t) and not _THOUSANDS.fullmatch(t)]
     thousands = [(n, t) for n, t in with_comma if _THOUSANDS.fullmatch(t) and not _DECIMAL_COMMA.fullmatch(t)]
@@ -283,18 +336,26 @@ def _text(cell: Any) -> str:
     return str(int(cell)) if isinstance(cell, float) and cell.is_integer() else str(cell).strip()
 
 
-def _number(cell: Any, mark: str, place: str) -> float:
-    if isinstance(cell, (int, float)) and not isinstance(cell, bool):
-        value = float(cell)
+def _number(cell: Any, mark: str, place: str, *, percent: bool = False) -> float:
+    if isinstance(cell, _Percent):
+        # What the spreadsheet shows as 50 % it keeps as 0.5.
+        value = 100.0 * cell if percent else float(cell)
+    elif isinstance(cell, (int, float)) and not isinstance(cell, bool):
+        value = float(cell) if abs(cell) < _TOO_LARGE else math.inf
     else:
-        text = _SPACES.sub("", _text(cell))
+        text = _SPACES.sub("", _text(cell)).replace("\u2212", "-")
+        if mark == "decimal" and _POINTS.fullmatch(text):
+            plain = text.replace(".", "")
+            raise ReadError(
+                f"{place}: {text!r} may be {plain} or {float(text):g}; write it without the point, or with a comma"
+            )
         if mark == "decimal" and _DECIMAL_COMMA.fullmatch(text):
             text = text.replace(".", "").replace(",", ".")
         elif mark == "thousands" and _THOUSANDS.fullmatch(text):
             text = text.replace(",", "")
         value = float(text) if _PLAIN.fullmatch(text) else float("nan")
     if value != value or abs(value) == float("inf"):
-        raise ReadError(f"{place}: found {_text(cell) or 'nothing'!r}, expected a number")
+        raise ReadError(f"{place}: found {_text(cell)[:40] or 'nothing'!r}, expected a number")
     return value
 
 

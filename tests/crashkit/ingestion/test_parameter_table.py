@@ -79,7 +79,7 @@ def test_run_without_row_is_told_by_name(tmp_path: Path) -> None:
         ("runs.json", '{"x": 3}', ReadError, "expected a list of rows"),
         ("runs.json", "[{", ReadError, "cannot be read as a table"),
         ("runs.xlsx", "no workbook", ReadError, "cannot be read as a table"),
-        ("runs.txt", "run a", ReadError, r"a parameter table is .csv, .json, .xlsx, not .txt"),
+        ("runs.txt", "run a", ReadError, r"a parameter table is .csv, .tsv, .json, .xlsx, not .txt"),
     ],
 )
 def test_faults_are_told_with_their_place(tmp_path: Path, name: str, content: str, kind: type, told: str) -> None:
@@ -208,3 +208,64 @@ def test_one_key_twice_in_json_is_refused(tmp_path: Path) -> None:
     (tmp_path / "runs.json").write_text('{"x": {"a": 1}, "x": {"a": 2}}')
     with pytest.raises(ReadError, match="'x' stands there twice"):
         read_parameter_table(tmp_path / "runs.json")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "told"),
+    [
+        ("runs.csv", "run;v\nx;1.500\ny;2.250,5\n", r"row 2 \(run x\), column 'v': '1.500' may be 1500 or 1.5"),
+        ("runs.csv", "run,v [m/s]\n,km/h\nx,1\n", "v is in m/s by its title and in km/h by the row of units"),
+        ("runs.csv", "run,Run,v\nx,a,1\n", "columns 'run' and 'Run' could both name the runs"),
+        ("runs.json", '[{"run": "x", "v": %s}]' % ("9" * 400), "found '9{40}', expected a number"),
+    ],
+)
+def test_what_contradicts_itself_is_refused(tmp_path: Path, name: str, content: str, told: str) -> None:
+    (tmp_path / name).write_text(content)
+    with pytest.raises(ReadError, match=told):
+        read_parameter_table(tmp_path / name)
+
+
+def test_tabs_typeset_minus_and_thin_spaces(tmp_path: Path) -> None:
+    (tmp_path / "runs.tsv").write_text("run\tv\nUnit:\tmm\nx\t\u22125\ny\t1\u2009000\n", "utf-8")
+    assert read_parameter_table(tmp_path / "runs.tsv").rows == {"x": {"v": (-5.0, "mm")}, "y": {"v": (1000.0, "mm")}}
+
+
+def workbook(path: Path, **sheets: list[list[object]]) -> Path:
+    import openpyxl
+
+    book = openpyxl.Workbook()
+    book.remove(book.active)
+    for title, lines in sheets.items():
+        sheet = book.create_sheet(title)
+        for line in lines:
+            sheet.append(line)
+        for row in sheet.iter_rows():
+            for cell in row:
+                if isinstance(cell.value, float) and cell.value < 1:
+                    cell.number_format = "0.0%"
+    book.save(path)
+    return path
+
+
+def test_numbers_that_a_spreadsheet_shows_in_percent_are_percent(tmp_path: Path) -> None:
+    path = workbook(tmp_path / "runs.xlsx", doe=[["run", "overlap [%]", "ratio"], ["x", 0.4, 0.5]])
+    assert read_parameter_table(path).rows["x"] == {"overlap": (40.0, "%"), "ratio": (0.5, "")}
+
+
+def test_the_sheet_with_the_runs_is_read_and_two_are_refused(tmp_path: Path) -> None:
+    lines = [["run", "v"], ["x", 3]]
+    one = workbook(tmp_path / "one.xlsx", cover=[["Project"]], doe=lines)
+    assert read_parameter_table(one).rows == {"x": {"v": (3.0, "")}}
+    with pytest.raises(ReadError, match="sheets 'doe' and 'old' both have a column of runs; keep one"):
+        read_parameter_table(workbook(tmp_path / "two.xlsx", doe=lines, old=lines))
+
+
+def test_a_cell_at_the_end_of_a_sheet_takes_no_memory(tmp_path: Path) -> None:
+    import openpyxl
+
+    path = workbook(tmp_path / "runs.xlsx", doe=[["run", "v"], ["x", 3]])
+    book = openpyxl.load_workbook(path)
+    book["doe"].cell(1_000_000, 1, "y")
+    book["doe"].cell(1_000_000, 2, 4)
+    book.save(path)
+    assert read_parameter_table(path).rows == {"x": {"v": (3.0, "")}, "y": {"v": (4.0, "")}}
