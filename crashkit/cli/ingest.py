@@ -13,13 +13,16 @@ from crashkit.cli._progress import Progress
 if TYPE_CHECKING:
     from crashkit.ingestion.ingest import IngestSummary
 
+# More common times than this are a slip of the keyboard.
+_MOST_TIMES = 100_000
+
 
 def command(
     sources: Annotated[list[Path], typer.Argument(help="Files or folders with solver runs.", show_default=False)],
     output: Annotated[Path, typer.Option("--output", "-o", help="Dataset to write: NAME.zarr or NAME.nc.")],
     params: Annotated[
         Path | None,
-        typer.Option(help="Table of design parameters, one row per run: CSV, JSON or XLSX.", show_default="none"),
+        typer.Option(help="Table of design parameters, one row per run: CSV, TSV, JSON or XLSX.", show_default="none"),
     ] = None,
     units: Annotated[
         str | None,
@@ -126,10 +129,10 @@ def _times(text: str) -> list[float] | None:
     try:
         begin, end, count = text.split(":")
         first, last, n = float(begin), float(end), int(count)
-        if n < 2 or last <= first:
+        if not 2 <= n <= _MOST_TIMES or not last > first:
             raise ValueError
     except ValueError as error:
         raise typer.BadParameter(
-            f"{text!r}; expected begin:end:count, such as 0:0.03:61", param_hint="--time"
+            f"{text!r}; expected begin:end:count, such as 0:0.03:61, with 2 to {_MOST_TIMES} times", param_hint="--time"
         ) from error
     return [first + (last - first) * k / (n - 1) for k in range(n)]

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from string import Formatter
 from typing import Any
 
 import numpy as np
@@ -314,6 +315,11 @@ def cell_fields(run: Run, name: str) -> list[str]:
 def _named(run: str, source: Path, pattern: str) -> str:
     try:
         whole = source.resolve()
+        asked = [(field, spec, how) for _, field, spec, how in Formatter().parse(pattern) if field is not None]
+        if odd := [field for field, spec, how in asked if field not in ("run", "source") or spec or how]:
+            raise ValueError(
+                f"{{{odd[0]}}} with what stands behind it" if odd[0] in ("run", "source") else f"{{{odd[0]}}}"
+            )
         return pattern.format(run=run, source=whole.name if whole.is_dir() else whole.stem)
     except (KeyError, IndexError, ValueError) as error:
         raise DataError(
@@ -457,7 +463,7 @@ def _in_dataset_units(values: Mapping[str, tuple[float, str]], place: Any) -> di
             factor, si = to_si(unit)
         except UnknownUnits as error:
             raise DataError(f"{place}: parameter {name}: {error}") from error
-        if not np.isfinite(value):
+        if not np.isfinite(value * factor):
             raise DataError(f"{place}: parameter {name} is {value}; expected a number")
         out[name] = (value * factor, si)
     return out
