@@ -143,6 +143,14 @@ class LevelRuns:
             self._notes.add(f"run {self._name(run)} does not move in any state; it is learnt as it is")
         return self._held(values, bad, run) if bad.any() else np.ascontiguousarray(values)
 
+    def there(self, run: int) -> NDArray[np.bool_] | None:
+        """(state, node) whether a node has a displacement of its own, and not one that `read` holds; None: all have."""
+        if not self._campaign.erodes and self._settings.missing != "hold":
+            return None
+        values = np.asarray(self._field[int(run)])
+        known = np.isfinite(values if self._chosen is None else values[:, self._chosen]).all(axis=2)
+        return None if known.all() else np.asarray(known)
+
     def samples(self, runs: NDArray[np.int64]) -> Tensor:
         """(sim * state, 3, node) of `runs`: rows are contiguous, so that a batch is gathered in whole states."""
         out = torch.empty(len(runs) * self.states, 3, self.nodes)

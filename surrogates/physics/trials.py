@@ -90,7 +90,8 @@ class Courses:
     own
         (run, state, mode); images (run, state, mode) of each plane.
     nodes
-        Judged nodes, states judged states, truth (run, judged state, judged node, 3), m.
+        Judged nodes, states judged states, truth (run, judged state, judged node, 3), m, and which
+        of these nodes are there; None: all.
     """
 
     modes: NDArray[np.float32]
@@ -100,6 +101,7 @@ class Courses:
     nodes: NDArray[np.int64]
     states: NDArray[np.int64]
     truth: NDArray[np.float32]
+    there: NDArray[np.bool_] | None = None
 
     @classmethod
     def of(
@@ -121,14 +123,20 @@ class Courses:
         nodes = np.sort(draw.permutation(runs.nodes)[:_JUDGED_NODES])
         states = np.unique(np.linspace(0, runs.states - 1, _JUDGED_STATES).astype(int))
         truth = np.empty((len(chosen), len(states), len(nodes), 3), np.float32)
+        there = np.ones(truth.shape[:3], bool)
         for k, run in enumerate(chosen):
             _log.info("coefficients of run %d of %d", k + 1, len(chosen))
             values = runs.read(run)
             own[k] = values.reshape(len(values), -1) @ basis
             truth[k] = values[states][:, nodes]
+            known = runs.there(run)
+            if known is not None:
+                there[k] = known[states][:, nodes]
             for plane, mirror in enumerate(mirrors):
                 images[plane][k] = mirrored(mirror, values).reshape(len(values), -1) @ basis
-        return cls(basis, campaign.time.astype(np.float64), own, images, nodes, states, truth)
+        return cls(
+            basis, campaign.time.astype(np.float64), own, images, nodes, states, truth, None if there.all() else there
+        )
 
     def registered(
         self, registration: Registration, parameters: NDArray[np.float64], plane: int
@@ -254,7 +262,12 @@ class Trials:
         c = self.courses
         rows = c.modes.reshape(-1, 3, c.modes.shape[1])[c.nodes].reshape(-1, c.modes.shape[1])
         said = (coefficients[:, c.states] @ rows.T).reshape(c.truth[held].shape)
-        return np.asarray(np.linalg.norm(said - c.truth[held], axis=-1).mean(axis=(1, 2)))
+        distance = np.linalg.norm(said - c.truth[held], axis=-1)
+        if c.there is None:
+            return np.asarray(distance.mean(axis=(1, 2)))
+        # What is gone has no truth: only living nodes count, and every state the same, as in the report.
+        living = c.there[held]
+        return np.asarray(((distance * living).sum(axis=2) / np.maximum(living.sum(axis=2), 1)).mean(axis=1))
 
 
 Machine = Gaussian | RadialBasis

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import plate
 import pytest
@@ -43,6 +45,19 @@ def found(of: Campaign, chosen: Settings):  # type: ignore[no-untyped-def]
     courses = courses_of(of, chosen, runs, Notes())
     trials = Trials(courses, of.parameters, Folds.of(len(runs), 6, 0), "pod-gpr", 0)
     return choose(of, runs, chosen, trials)
+
+
+def test_errors_of_folds_count_what_is_there() -> None:
+    whole = crash(8)
+    u = np.array(whole.displacement(0))
+    u[3, 6:, :10] = np.nan  # ten of thirty nodes are gone from the seventh state on
+    runs, chosen = np.arange(8), settings("pod-gpr")
+    eroded = replace(whole, displacement=lambda level: u, erodes=True)
+    courses = courses_of(eroded, chosen, runs, Notes())
+    trials = Trials(courses, eroded.parameters, Folds.of(8, 6, 0), "pod-gpr", 0)
+    nothing = np.zeros((1, len(TIME), courses.modes.shape[1]), np.float32)
+    expected = np.nanmean(np.linalg.norm(u[3][:, courses.nodes], axis=-1), axis=1)[courses.states].mean()
+    assert trials.distances(np.array([3]), nothing)[0] == pytest.approx(expected, rel=1e-5)
 
 
 def test_clock_and_damage_number_are_found_and_worth_it() -> None:
