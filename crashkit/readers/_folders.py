@@ -74,7 +74,8 @@ def runs_in(
         for own, family in found.runs.items():
             inside = own if folder is path else f"{folder.name}/{own}"
             alone = len(found.runs) == 1 and not (folder is path and own_name_at_top)
-            name = folder.resolve().name if alone else inside
+            # A link to a folder is called by its own name, so that two links to one run differ.
+            name = (folder if folder is not path else folder.resolve()).name if alone else inside
             name = f"{folder.name}/{own}" if name in out.runs else name
             if name in out.runs:
                 raise ReadError(f"{folder / own}: another run of {path} is called {name!r} as well; rename one of them")

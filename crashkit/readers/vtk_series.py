@@ -93,7 +93,7 @@ def _found(path: Path) -> Collected[Sequence[Path]]:
 
 
 def _lists(folder: Path) -> list[Path]:
-    return [p for p in files_in(folder) if p.suffix in (".pvd", ".series") and kind_of(p) in _LISTS]
+    return [p for p in files_in(folder) if p.suffix.lower() in (".pvd", ".series") and kind_of(p) in _LISTS]
 
 
 def _stem(file: Path) -> str:
@@ -107,7 +107,7 @@ def _numbered(folder: Path, listed: set[Path]) -> dict[str, list[Path]]:
     families: dict[tuple[str, str], dict[int, Path]] = {}
     for file in files_in(folder):
         match = _NUMBERED.fullmatch(file.stem)
-        if match and file.suffix in _NUMBERED_SUFFIXES and file.resolve() not in listed:
+        if match and file.suffix.lower() in _NUMBERED_SUFFIXES and file.resolve() not in listed:
             states = families.setdefault((match["stem"], file.suffix), {})
             if int(match["number"]) in states:
                 raise ReadError(

@@ -302,3 +302,17 @@ def test_checkpoints_of_dolfinx_are_called_by_their_name(tmp_path):
     (tmp_path / "u.bp").mkdir()
     with pytest.raises(ReadError, match="is an ADIOS2 checkpoint"):
         reader_for(tmp_path / "u.bp")
+
+
+def test_suffixes_in_capitals_are_the_same_suffixes(tmp_path):
+    for file in states(tmp_path / "numbered", 1, time=True):
+        file.rename(file.with_suffix(".VTU"))
+    assert last_moves(tmp_path / "numbered") == {"numbered": 2}
+    listed(tmp_path / "lists", "one", 3).rename(tmp_path / "lists" / "ONE.PVD")
+    assert last_moves(tmp_path / "lists") == {"ONE": 6}
+
+
+def test_a_link_to_a_folder_is_called_by_its_own_name(tmp_path):
+    states(tmp_path / "run_1", 1, time=True)
+    (tmp_path / "run_2").symlink_to(tmp_path / "run_1")
+    assert last_moves(tmp_path) == {"run_1": 2, "run_2": 2}
