@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from memory_runs import MemoryRun, RunsInMemory, plate, shuffled
 from test_structure import block
 
-from crashkit.dataset import open_dataset
+from crashkit.dataset import demo_data, open_dataset
 from crashkit.errors import CrashkitError, DataError, OutputError, ReadError
 from crashkit.ingestion import transfer
 from crashkit.ingestion.ingest import IngestSummary, ingest
@@ -485,3 +485,14 @@ def test_units_of_a_table_become_si_and_a_negative_speed_is_said(place: Place) -
         assert float(dataset["speed"][0]) == pytest.approx(-3.048)
         assert float(dataset["pressure"][0]) == pytest.approx(6894757.293)
         assert [dataset[n].attrs["units"] for n in ("speed", "pressure", "pulse")] == ["m s-1", "Pa", "m s-2"]
+
+
+def test_a_mesh_that_is_no_file_is_refused_even_where_no_mesh_is_needed(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"--mesh is nowhere\.vtp, which is no file"):
+        ingest(demo_data(), tmp_path / "out.zarr", mesh="nowhere.vtp")
+
+
+@pytest.mark.parametrize("names", ["{run.__class__}", "{run:>1000000000}", "{run!r}", "{foo}"])
+def test_names_hold_run_and_source_alone(tmp_path: Path, names: str) -> None:
+    with pytest.raises(DataError, match=r"not understood .*; expected text with \{run\} and \{source\}"):
+        ingest(demo_data(), tmp_path / "out.zarr", names=names)
