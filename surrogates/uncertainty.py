@@ -140,11 +140,11 @@ def calibrate_gathered(
 
 
 def gather(distances: Iterable[NDArray[np.float32]]) -> Gathered:
-    """Means (run, node) and (run, state), and the distances (state, some nodes) of each run."""
+    """Means (run, node) and (run, state), and the distances (state, some nodes) of each run; NaN where a node is gone."""
     by_node, by_state, pooled = [], [], []
     for distance in distances:
-        by_node.append(distance.mean(axis=0, dtype=np.float64))
-        by_state.append(distance.mean(axis=1, dtype=np.float64))
+        by_node.append(np.nanmean(distance, axis=0, dtype=np.float64))
+        by_state.append(np.nanmean(distance, axis=1, dtype=np.float64))
         some = np.unique(np.linspace(0, distance.shape[1] - 1, _POOLED).astype(int))
         pooled.append(distance[:, some])
     if not pooled:
@@ -165,7 +165,8 @@ def _product(
     for k, distance in enumerate(pooled):
         others = which != which[k]
         node, state = _scale(by_node[others], by_state[others])
-        ratios.append((distance / (share[k] * state[:, None] * node[some])).ravel())
+        ratio = (distance / (share[k] * state[:, None] * node[some])).ravel()
+        ratios.append(ratio[np.isfinite(ratio)])
     factor = np.quantile(np.concatenate(ratios), SHARES)
     return (*_scale(by_node, by_state), factor)
 

@@ -136,8 +136,8 @@ def _judge_by_folds(surrogate: Surrogate, trainer: Trainer, found: PodFit) -> No
         for held in found.held():
             places.append(held.run)
             deviations.append(held.deviation)
-            distance = _distance(held.predicted, field.read(runs[held.run]))
-            errors.append(float(distance.mean()))
+            distance = _off(held.predicted, field, runs[held.run])
+            errors.append(_mean(distance))
             yield distance
 
     gathered = gather(distances())
@@ -227,13 +227,13 @@ def _judge(surrogate: Surrogate, trainer: Trainer) -> None:
         def own(number: int = number, runs: LevelRuns = runs, reduced: list[float] = reduced) -> Iterator[_Judged]:
             for run, predicted in _left_out(surrogate, trainer, number):
                 truth = runs.read(run)
-                reduced.append(float(_distance(surrogate.reconstruct(truth, number), truth).mean()))
-                yield run, _distance(predicted, truth)
+                reduced.append(_mean(_off(surrogate.reconstruct(truth, number), runs, run)))
+                yield run, _off(predicted, runs, run)
 
         def lifted(number: int = number) -> Iterator[_Judged]:
             for run, predicted in _left_out(surrogate, trainer, number):
                 if full is not None:
-                    yield run, _distance(surrogate.lift(predicted, number), full.read(run))
+                    yield run, _off(surrogate.lift(predicted, number), full, run)
 
         _note(surrogate, trainer, name, (number, False), own())
         if full is not None and number > 0:
@@ -275,7 +275,7 @@ def _note(
     def distances() -> Iterator[NDArray[np.float32]]:
         for run, distance in judged:
             places.append(run)
-            errors.append(float(distance.mean()))
+            errors.append(_mean(distance))
             yield distance
 
     gathered = gather(distances())
@@ -308,12 +308,12 @@ def node_errors(surrogate: Surrogate, trainer: Trainer, number: int) -> NDArray[
     if isinstance(trainer, FoldTrainer):
         told = list(_left_out(surrogate, trainer, number))
         mean: NDArray[np.float64] = np.mean(
-            [_distance(said, runs.read(run)).mean(axis=0) for run, said in told], axis=0, dtype=np.float64
+            [np.nanmean(_off(said, runs, run), axis=0) for run, said in told], axis=0, dtype=np.float64
         )
         return mean
     held = trainer.split.validation if len(trainer.split.validation) else trainer.split.training
     for run in held:
-        total += _distance(_predicted(surrogate, trainer.campaign, run, number), runs.read(run)).mean(axis=0)
+        total += np.nanmean(_off(_predicted(surrogate, trainer.campaign, run, number), runs, run), axis=0)
     return total / len(held)
 
 
@@ -321,6 +321,13 @@ def _predicted(surrogate: Surrogate, campaign: Campaign, run: int, number: int) 
     return surrogate.predict(campaign.parameters[run], campaign.time, number)
 
 
-def _distance(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(state, node)"""
-    return np.asarray(np.linalg.norm(a - b, axis=-1))
+def _off(said: NDArray[np.float32], runs: LevelRuns, run: int) -> NDArray[np.float32]:
+    """(state, node), m: how far `said` is from the truth of a run; NaN where the node is gone, which no error counts."""
+    distance = np.asarray(np.linalg.norm(said - runs.read(run), axis=-1))
+    there = runs.there(run)
+    return distance if there is None else np.where(there, distance, np.float32(np.nan))
+
+
+def _mean(distance: NDArray[np.float32]) -> float:
+    """e2, m: the mean over living nodes, then over states."""
+    return float(np.nanmean(distance, axis=1).mean())

@@ -180,3 +180,17 @@ def test_a_run_that_comes_several_times_never_judges_itself() -> None:
     twice = calibrate([*once, *once], TIME, runs=np.array([0, 1, 2, 3, 0, 1, 2, 3]))
     np.testing.assert_allclose(twice.half_width(0.9, TIME), calibrate(once, TIME).half_width(0.9, TIME), rtol=1e-5)
     assert twice.runs == 4
+
+
+def test_nodes_that_are_gone_are_in_no_band() -> None:
+    draw = np.random.default_rng(0)
+    runs = [draw.rayleigh(0.01, (6, 40)).astype(np.float32) for _ in range(8)]
+    gone = [run.copy() for run in runs]
+    for run in gone:
+        run[4:, :5] = np.nan
+    time = np.arange(6.0)
+    whole, some = calibrate(runs, time).half_width(0.9, time), calibrate(gone, time).half_width(0.9, time)
+    assert np.isfinite(some).all()
+    there = np.isfinite(np.stack(gone))
+    assert (np.stack(runs) <= some)[there].mean() == pytest.approx(0.9, abs=0.03)
+    np.testing.assert_allclose(some.mean(), whole.mean(), rtol=0.05)
