@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
 from crashkit.readers._checks import require_indices
+from crashkit.readers._names import NODE_IDS
 
 Place = Literal["point", "cell"]
 
@@ -118,6 +119,12 @@ class WholeStates(GridSource):
                 raise ReadError(
                     f"{self.place(state)}: lacks the array {missing[0]!r} of the first state; it is cut short, or its "
                     "output changed during the run, which is not supported"
+                )
+            numbers = [n for n, v in first.point_data.items() if n.lower() in NODE_IDS and v.ndim == 1]
+            if other := next((n for n in numbers if not np.array_equal(grid.point_data[n], first.point_data[n])), None):
+                raise ReadError(
+                    f"{self.place(state)}: numbers its nodes otherwise than the first state ({other}); expected one order "
+                    "of nodes in all states"
                 )
             self._kept = (state, grid)
         return self._kept[1]

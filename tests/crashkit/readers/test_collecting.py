@@ -316,3 +316,12 @@ def test_a_link_to_a_folder_is_called_by_its_own_name(tmp_path):
     states(tmp_path / "run_1", 1, time=True)
     (tmp_path / "run_2").symlink_to(tmp_path / "run_1")
     assert last_moves(tmp_path) == {"run_1": 2, "run_2": 2}
+
+
+def test_nodes_in_another_order_in_a_later_state_are_refused(tmp_path):
+    for k, file in enumerate(states(tmp_path, 1, time=True)):
+        grid = pv.read(file)
+        grid.point_data["node_id"] = np.roll(np.arange(4), k == 2)
+        grid.save(file)
+    with pytest.raises(ReadError, match=r"out_2.vtu.*numbers its nodes otherwise than the first state \(node_id\)"):
+        last_moves(tmp_path)
