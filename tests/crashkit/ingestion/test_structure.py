@@ -73,6 +73,15 @@ def test_unknown_part_is_told_with_those_there_are() -> None:
         structure_of(plate(), parts=["door"])
 
 
+@pytest.mark.parametrize("count", [11, 12, 13])
+def test_of_many_parts_the_first_twelve_are_named_and_only_then_are_there_more(count: int) -> None:
+    mesh = replace(plate(), parts=tuple(Part(100 + k, "") for k in range(count)))
+    with pytest.raises(DataError) as caught:
+        structure_of(mesh, parts=["hood"])
+    listing = str(caught.value).partition("the runs have ")[2].partition(";")[0]
+    assert listing == ", ".join(str(100 + k) for k in range(min(count, 12))) + (" ..." if count > 12 else "")
+
+
 def test_nothing_left_is_an_error() -> None:
     with pytest.raises(DataError, match="nothing is left of the mesh"):
         structure_of(plate(), parts=["rail*"], exclude_parts=["rail*"])
