@@ -194,3 +194,12 @@ def test_nodes_that_are_gone_are_in_no_band() -> None:
     there = np.isfinite(np.stack(gone))
     assert (np.stack(runs) <= some)[there].mean() == pytest.approx(0.9, abs=0.03)
     np.testing.assert_allclose(some.mean(), whole.mean(), rtol=0.05)
+
+
+def test_runs_that_are_harder_say_no_more_about_which_nodes_are_hard() -> None:
+    """Easy runs are half as bad again on node 1, hard ones on node 0: measured by the size of each run, nodes are alike."""
+    size = np.array([1.0, 100.0] * 4)
+    profile = {1.0: [2.0, 3.0], 100.0: [3.0, 2.0]}
+    told = [np.full((3, 1), s, np.float32) * np.float32(profile[s]) for s in size]
+    band = calibrate(told, np.arange(3.0), Beliefs(size, np.ones(8)))
+    assert band.node[0] == pytest.approx(band.node[1], rel=1e-6)
