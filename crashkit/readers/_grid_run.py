@@ -102,9 +102,13 @@ class GridRun(Run):
         last = len(self.time) - 1
         ends = source.points(last) if last else grid.points
         moving = not np.array_equal(ends, grid.points)
-        name = next(
-            (n for n, v in grid.point_data.items() if field_name(n) in DISPLACEMENT_NAMES and v.shape[1:] == (3,)), None
-        )
+        vectors = [n for n, v in grid.point_data.items() if field_name(n) in DISPLACEMENT_NAMES and v.shape[1:] == (3,)]
+        # "u" is a velocity to some: the plainer name goes before it, and what is passed over is said.
+        vectors.sort(key=lambda n: DISPLACEMENT_NAMES.index(field_name(n)))
+        name = vectors[0] if vectors else None
+        if vectors[1:]:
+            others = " and ".join(repr(n) for n in vectors[1:])
+            self.notes = (f"{source.place(0)}: displacements are read from the array {name!r}, not from {others}",)
         if name is None:
             if not last:
                 raise ReadError(

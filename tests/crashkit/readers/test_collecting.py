@@ -325,3 +325,15 @@ def test_nodes_in_another_order_in_a_later_state_are_refused(tmp_path):
         grid.save(file)
     with pytest.raises(ReadError, match=r"out_2.vtu.*numbers its nodes otherwise than the first state \(node_id\)"):
         last_moves(tmp_path)
+
+
+def test_of_two_arrays_the_one_called_displacement_is_read_and_the_other_named(tmp_path):
+    for k, file in enumerate(states(tmp_path, 1, time=True)):
+        grid = pv.read(file)
+        moved = grid.point_data.pop("displacement")
+        grid.point_data["U"] = 9.0 * k + 0 * moved
+        grid.point_data["Displacement"] = moved
+        grid.save(file)
+    (run,) = reader_for(tmp_path).runs(tmp_path)
+    assert float(run.displacement(2, 3).max()) == 2
+    assert "displacements are read from the array 'Displacement', not from 'U'" in run.notes[0]
