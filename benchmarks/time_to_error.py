@@ -67,7 +67,7 @@ def trained(data: Path, folder: Path, preset: str, epochs: int, test: str) -> Su
         last = epoch.name
 
     made = train(
-        data, folder, "mh", settings=overrides, preset=preset, test=test, device="cpu", resume=resume, report=tell
+        data, folder, "mh", settings=overrides, preset=preset, test=test, device="cpu", resume=resume, on_epoch=tell
     )
     done[last] = time.perf_counter() - started
     if any(fit.status == "interrupted" for fit in made.record.fits.values()):

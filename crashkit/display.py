@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import html
+import sys
+import time
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Literal
+
+from data_schema.progress import Progress, silent
 
 Facts = Mapping[str, object]
 Rows = Sequence[Sequence[object]]
@@ -58,3 +63,46 @@ def _aligned(row: Sequence[str], widths: Sequence[int]) -> list[str]:
 def _row(kind: str, cells: Sequence[object], other: str = "", others: Sequence[object] = ()) -> str:
     pieces = [(kind, cell) for cell in cells] + [(other, cell) for cell in others]
     return "<tr>" + "".join(f"<{tag}>{html.escape(str(cell))}</{tag}>" for tag, cell in pieces) + "</tr>"
+
+
+def watched(report: Progress | None, progress: bool | Literal["auto"] = "auto") -> Progress:
+    """`report`, or a line below a notebook's cell where nobody listens and this is a notebook (or `progress` is True)."""
+    if report is not None:
+        return report
+    if progress is False or (progress == "auto" and not in_notebook()):
+        return silent
+    return NotebookLine()
+
+
+def in_notebook() -> bool:
+    """Whether this runs in the kernel of a notebook, which shows what it is given as HTML."""
+    shell = sys.modules.get("IPython")
+    found = shell.get_ipython() if shell is not None else None
+    return found is not None and hasattr(found, "kernel")
+
+
+class NotebookLine:
+    """One line below a cell that is written anew: what is being done, how far it is, and a note."""
+
+    def __init__(self) -> None:
+        self._shown: Any = None
+        self._last = 0.0
+
+    def __call__(self, what: str, done: int, total: int, note: str) -> None:
+        now = time.monotonic()
+        if self._shown is not None and now - self._last < 0.2 and done != total:
+            return
+        self._last = now
+        from IPython.display import HTML, display
+
+        line = HTML(progress_html(what, done, total, note))
+        if self._shown is None:
+            self._shown = display(line, display_id=True)
+        else:
+            self._shown.update(line)
+
+
+def progress_html(what: str, done: int, total: int, note: str) -> str:
+    """The line as HTML; every text is escaped."""
+    bar = f'<progress value="{done}" max="{total}"></progress> {done}/{total}' if total else str(done or "")
+    return f"<div>{html.escape(what)} {bar} {html.escape(note)}</div>"

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
+
+from crashkit.display import watched
+from data_schema.progress import Progress
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -20,7 +23,8 @@ def coarsen(
     *,
     selection: Literal["quadric", "vtk"] = "quadric",
     pair_distance: float | None = None,
-    report: Callable[[int, int], None] | None = None,
+    report: Progress | None = None,
+    progress: bool | Literal["auto"] = "auto",
 ) -> Hierarchy:
     """Build the mesh hierarchy of a dataset, and write it into the dataset where that is given by its path.
 
@@ -42,7 +46,9 @@ def coarsen(
     pair_distance
         m; see `crashkit.mesh.build_hierarchy`.
     report
-        Called with (runs done, runs) in the pass over the runs.
+        Called with (what, runs done, runs, note) in the pass over the runs.
+    progress
+        Show a line of progress in a notebook; "auto": where this is one.
 
     Raises
     ------
@@ -75,5 +81,5 @@ def coarsen(
     if not isinstance(dataset, xr.Dataset):
         for text in parts_without_faces(Path(dataset)):
             warnings.warn(text, stacklevel=2)
-        write_hierarchy(dataset, hierarchy, progress=report)
+        write_hierarchy(dataset, hierarchy, report=watched(report, progress))
     return hierarchy

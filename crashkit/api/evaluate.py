@@ -10,7 +10,10 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
+
+from crashkit.display import watched
+from data_schema.progress import Progress
 
 if TYPE_CHECKING:
     import numpy as np
@@ -31,8 +34,6 @@ if TYPE_CHECKING:
 
     GivenModel = Trained | Surrogate | str | Path
 
-Progress = Callable[[str, int, int], None]  # what is being done, steps done, steps in all
-
 
 def evaluate(
     dataset: str | Path | xr.Dataset,
@@ -51,6 +52,7 @@ def evaluate(
     seeds_as_spread: bool = True,
     overwrite: bool = False,
     report: Progress | None = None,
+    progress: bool | Literal["auto"] = "auto",
 ) -> Evaluation:
     """Compare models on runs none of them has seen, and write everything into the folder `output`.
 
@@ -85,7 +87,9 @@ def evaluate(
     overwrite
         Replace an earlier report in `output`.
     report
-        Called with what is being done and how far it is.
+        Called with (what, steps done, steps in all or 0, note).
+    progress
+        Show a line of progress in a notebook; "auto": where this is one.
 
     Raises
     ------
@@ -110,7 +114,7 @@ def evaluate(
     from evaluation.report.files import default_runs, write_run
     from evaluation.report.report import write_report
 
-    tell = report or (lambda what, done, total: None)
+    tell = watched(report, progress)
     formats = [suffix for suffix, wanted in ((".pvd", write_vtu), (".vtkhdf", write_vtkhdf)) if wanted]
     if output is not None and not overwrite:
         refuse_earlier(Path(output), "report.json", "report")
@@ -422,9 +426,9 @@ def _counted(tell: Progress, what: str, total: int | None) -> Iterator[Callable[
     def step(_: int) -> None:
         nonlocal count
         count += 1
-        tell(what, count, total or 0)
+        tell(what, count, total or 0, "")
 
-    tell(what, 0, total or 0)
+    tell(what, 0, total or 0, "")
     yield step
 
 

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from data_schema.progress import Progress
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
@@ -16,7 +18,6 @@ if TYPE_CHECKING:
     from crashkit.campaign.executors import Executor
     from surrogates.design.judgement import Judgement
 
-Progress = Callable[[int, int, str], None]
 Say = Callable[[str], None]
 
 
@@ -56,7 +57,7 @@ def run_campaign(
     most_runs: int | None = None,
     executor: Executor | None = None,
     retry: bool = False,
-    progress: Progress | None = None,
+    report: Progress | None = None,
     say: Say | None = None,
 ) -> CampaignSummary:
     """Compute the runs of a campaign, and go on until its wish is met.
@@ -76,8 +77,8 @@ def run_campaign(
         Where runs are computed; default: processes of this machine, or what the file says.
     retry
         Compute failed runs again.
-    progress, say
-        Called with (runs decided, runs in all, names of those running), and with a sentence after each step.
+    report, say
+        `report` hears how many runs are decided and which are running; `say` hears a sentence after each step.
 
     Returns
     -------
@@ -110,7 +111,7 @@ def run_campaign(
             campaign.add(_first_points(campaign), "start")
         started = time.monotonic()
         while True:
-            _compute(campaign, progress)
+            _compute(campaign, report)
             added = _ingest(campaign)
             counts = {s: len(campaign.table.runs(s)) for s in ("done", "failed", "refused")}
             speak(f"{counts['done']} runs done, {counts['failed']} failed, {counts['refused']} refused")
@@ -242,20 +243,20 @@ def _filling(campaign: Campaign, count: int) -> NDArray[np.float64]:
     )
 
 
-def _compute(campaign: Campaign, progress: Progress | None) -> None:
+def _compute(campaign: Campaign, report: Progress | None) -> None:
     """Compute what waits; the status page follows each change."""
     from crashkit.campaign.status import write_page
 
     seen = ""
 
-    def follow(done: int, total: int, note: str) -> None:
+    def follow(what: str, done: int, total: int, note: str) -> None:
         nonlocal seen
         state = f"{done} {total} {note}"
         if state != seen:
             seen = state
             write_page(campaign)
-        if progress is not None:
-            progress(done, total, note)
+        if report is not None:
+            report(what, done, total, note)
 
     campaign.compute(follow)
 

@@ -6,7 +6,10 @@ import contextlib
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
+
+from crashkit.display import watched
+from data_schema.progress import Progress
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -37,7 +40,9 @@ def train(
     overwrite: bool = False,
     checkpoint_every: int = 0,
     tensorboard: str | Path | None = None,
-    report: Callable[[Epoch], None] | None = None,
+    report: Progress | None = None,
+    on_epoch: Callable[[Epoch], None] | None = None,
+    progress: bool | Literal["auto"] = "auto",
 ) -> Model:
     """Train a surrogate, and store it as the folder `output`.
 
@@ -76,7 +81,11 @@ def train(
     tensorboard
         Folder for TensorBoard files.
     report
-        Called after every epoch.
+        Called with (level, epochs done, epochs, note) after every epoch.
+    on_epoch
+        Called with the losses and rates of every epoch.
+    progress
+        Show a line of progress in a notebook; "auto": where this is one.
 
     Returns
     -------
@@ -128,10 +137,13 @@ def train(
             state or Path(scratch) / "training", chosen, campaign, every=checkpoint_every, resume=resume
         )
 
+        tell_progress = watched(report, progress)
+
         def tell(epoch: Epoch) -> None:
             note(epoch)
-            if report is not None:
-                report(epoch)
+            tell_progress(epoch.name, epoch.epoch, epoch.epochs, epoch.note())
+            if on_epoch is not None:
+                on_epoch(epoch)
 
         rescued = None if folder is None or not first else _rescued(folder, keeper.fingerprint, overwrite)
         if rescued is not None:

@@ -14,7 +14,7 @@ import hashlib
 import json
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +27,8 @@ from crashkit.campaign.deck import arguments, check_template, program_of, templa
 from crashkit.campaign.executors import Executor, Local, Slurm
 from crashkit.campaign.study import Study, read_study
 from crashkit.campaign.table import Run, Table
+from data_schema.progress import Progress, silent
 
-Progress = Callable[[int, int, str], None]
 _POLL = 0.2  # seconds between two looks at the jobs
 _DIGITS = 7  # of a parameter, so that deck, command and table say the same number
 _LOCK = ".lock"
@@ -101,12 +101,12 @@ class Campaign:
         new = [row for k, row in enumerate(rows) if tuple(row) not in known and row not in rows[:k]]
         return self.table.add([dict(zip(self.study.names, row, strict=True)) for row in new], origin)
 
-    def compute(self, progress: Progress | None = None) -> list[Run]:
+    def compute(self, report: Progress | None = None) -> list[Run]:
         """Compute all waiting runs, a limited number at a time, and return the runs that were decided on the way.
 
         Runs that a killed campaign left running are picked up. Ctrl-C stops the jobs; their runs wait again.
         """
-        tell = progress or (lambda done, total, note: None)
+        tell = report or silent
         before = {r.name for r in self.table.runs("done", "failed", "refused")}
         try:
             while True:
@@ -117,7 +117,7 @@ class Campaign:
                 running = self.table.runs("running")
                 decided = [r for r in self.table.runs("done", "failed", "refused") if r.name not in before]
                 left = self.table.runs("waiting")
-                tell(len(decided), len(decided) + len(running) + len(left), ", ".join(r.name for r in running))
+                tell("runs", len(decided), len(decided) + len(running) + len(left), ", ".join(r.name for r in running))
                 if not running and not left:
                     return decided
                 time.sleep(_POLL)

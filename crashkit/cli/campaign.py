@@ -47,7 +47,7 @@ def command(
         try:
             summary = run_campaign(
                 study, output, until=until or None, confidence=confidence, most_runs=most_runs, retry=retry,
-                progress=lambda done, total, note: shown.step("runs", done, total, note),
+                report=shown.step,
                 say=None if json else say,
             )  # fmt: skip
         except KeyboardInterrupt:

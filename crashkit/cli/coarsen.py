@@ -69,7 +69,7 @@ def command(
             factors or None,
             selection="vtk" if selection == "vtk" else "quadric",
             pair_distance=pair_distance,
-            report=lambda done, runs: shown.step("interpolation errors", done, runs),
+            report=shown.step,
         )
     without = [str(w.message) for w in told if w.category is UserWarning]
     levels = summarize_hierarchy(path)

@@ -82,7 +82,7 @@ def command(
                 keep_rigid_walls=keep_rigid_walls, fields=names(fields), time=_times(time),
                 on_error="skip" if on_error == "skip" else "stop", allow_incomplete=allow_incomplete,
                 overwrite=overwrite, workers=workers, scheduler=scheduler,
-                progress=lambda done, total, note: shown.step("ingest", done, total, note),
+                report=shown.step,
             )  # fmt: skip
         except KeyboardInterrupt:
             partial = output.with_name(output.name + ".partial")

@@ -61,7 +61,7 @@ def command(
         surrogate = train(
             dataset, output, model or None, preset=preset or None, settings=given, config=config, seed=seed,
             epochs=epochs, test=test or None, device=device, resume=resume, overwrite=overwrite,
-            tensorboard=tensorboard, report=epoch_lines(shown, verbose),
+            tensorboard=tensorboard, on_epoch=epoch_lines(shown, verbose),
         ).surrogate  # fmt: skip
     if json:
         print_json(_as_json(surrogate, output))
@@ -104,13 +104,7 @@ def epoch_lines(shown: Progress, verbose: bool = False) -> Callable[[Epoch], Non
     """Reports of epochs as lines of progress."""
 
     def report(epoch: Epoch) -> None:
-        if epoch.validation_error == epoch.validation_error:
-            note = (
-                f"validation {100 * epoch.validation_error:.2f} cm "
-                f"(best {100 * epoch.best_error:.2f}, epoch {epoch.best_epoch})"
-            )
-        else:
-            note = f"training loss {epoch.total:.2e}, no validation runs"
+        note = epoch.note()
         if verbose:
             note += (
                 f" | total {epoch.total:.3e} = approximation {epoch.approximation:.3e} + reconstruction "

@@ -10,7 +10,7 @@ the same bytes; a dataset that is appended to stays whole until the new one repl
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from crashkit.display import Described, Facts, Rows, listed
+from crashkit.display import Described, Facts, Rows, listed, watched
 from crashkit.errors import CrashkitError, DataError, OutputError, ReadError
 from crashkit.ingestion.alignment import common_time, reach, same_time
 from crashkit.ingestion.assembly import Existing, publish
@@ -32,11 +32,10 @@ from crashkit.ingestion.transfer import Layout, is_whole, let_memory_go, transfe
 from crashkit.parallel import as_finished
 from crashkit.version import __version__
 from data_schema import run_checksum
+from data_schema.progress import Progress
 
 if TYPE_CHECKING:
     from crashkit.mesh.levels import Hierarchy
-
-Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True, repr=False)
@@ -112,7 +111,8 @@ def ingest(
     overwrite: bool = False,
     workers: int = 1,
     scheduler: str | None = None,
-    progress: Progress | None = None,
+    report: Progress | None = None,
+    progress: bool | Literal["auto"] = "auto",
 ) -> IngestSummary:
     """Read all runs in `sources` (files or folders) and write them as one dataset to `output` (`.zarr` or `.nc`).
 
@@ -157,8 +157,10 @@ def ingest(
         Number of processes on this machine (a script that uses several needs `if __name__ == "__main__":`).
     scheduler
         Address of a Dask scheduler to use instead; its workers must be able to read the same files.
+    report
+        Called with (what, steps done, steps in all or 0, note).
     progress
-        Called with (runs done, runs in all or 0, note).
+        Show a line of progress in a notebook; "auto": where this is one.
     """
     output = Path(output)
     paths = [Path(sources)] if isinstance(sources, (str, Path)) else [Path(s) for s in sources]
@@ -182,7 +184,7 @@ def ingest(
             wanted=None if time is None else np.asarray(time, np.float64),
             stop=on_error == "stop",
             overwrite=overwrite,
-            tell=progress or (lambda done, total, note: None),
+            tell=watched(report, progress),
         )
         try:
             return job.run(paths, _Workers(workers, scheduler))
@@ -224,7 +226,7 @@ class _Job:
             fresh = [f for f in fresh if f.name in staged]
             if not fresh:
                 raise DataError(f"no run can be used ({look.reasons()})")
-            self.tell(len(fresh), len(fresh), "putting the dataset together")
+            self.tell("ingest", len(fresh), len(fresh), "putting the dataset together")
             hierarchy = _hierarchy_of(former)
             names = publish(staging, layout, fresh, staged, old, hashes)
         if hierarchy is not None:
@@ -255,7 +257,7 @@ class _Job:
             grid = self.wanted if self.wanted is not None or structure is None or old is None else old.time
             return survey(
                 sources, self.choice, params=self.params, time=grid, structure=structure, stop=self.stop,
-                tell=lambda name: self.tell(0, 0, f"looking at {name}"),
+                tell=lambda name: self.tell("ingest", 0, 0, f"looking at {name}"),
             )  # fmt: skip
 
         if old is None:
@@ -344,7 +346,7 @@ class _Job:
             staged = staging.runs.get(keys[found.name])
             if staged is None:
                 continue
-            self.tell(len(out), len(fresh), f"{found.name} was read before")
+            self.tell("ingest", len(out), len(fresh), f"{found.name} was read before")
             if is_whole(staged, staging.place(staged.key)):
                 out[found.name] = staged
         return out
@@ -371,7 +373,7 @@ class _Job:
                 staged[outcome.name] = outcome
             else:
                 look.refuse(todo[place].name, outcome, self.stop)
-            self.tell(len(staged), len(fresh), todo[place].name)
+            self.tell("ingest", len(staged), len(fresh), todo[place].name)
 
 
 # --- who does the work -------------------------------------------------------------------------------------------

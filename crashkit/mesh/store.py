@@ -29,6 +29,7 @@ from crashkit.mesh.lifting import LiftingError, LiftingMeter
 from crashkit.netcdf import handle, open_netcdf
 from crashkit.readers.base import split_states
 from data_schema.levels import Level
+from data_schema.progress import Progress
 from data_schema.replace import beside, put_in_place, room_beside
 
 if TYPE_CHECKING:
@@ -46,12 +47,10 @@ if TYPE_CHECKING:
 _BUDGET = 512 << 20
 
 
-def write_hierarchy(
-    path: str | Path, hierarchy: Hierarchy, *, progress: Callable[[int, int], None] | None = None
-) -> list[LiftingError]:
+def write_hierarchy(path: str | Path, hierarchy: Hierarchy, *, report: Progress | None = None) -> list[LiftingError]:
     """Write `hierarchy` into the dataset at `path` and return the lifting error of each level over all runs.
 
-    The displacements are read once, a block of states at a time; `progress(runs done, runs)` is called after each
+    The displacements are read once, a block of states at a time; `report` hears of each
     run. An older hierarchy is replaced when the new one is complete.
 
     Raises
@@ -78,7 +77,7 @@ def write_hierarchy(
         try:
             with _target(path) as target:
                 target.group("hierarchy", about)
-                errors = _stream(path, dataset, hierarchy, target, progress)
+                errors = _stream(path, dataset, hierarchy, target, report)
                 for level, error in zip(hierarchy.levels, errors, strict=True):
                     _write_level(target, level, error)
         except OSError as error:
@@ -315,7 +314,7 @@ def _stream(
     dataset: xr.Dataset,
     hierarchy: Hierarchy,
     target: _Target,
-    progress: Callable[[int, int], None] | None,
+    report: Progress | None,
 ) -> list[LiftingError]:
     """One pass over the fine field: the displacements of level 1 go out, lifting errors add up."""
     meter = LiftingMeter(hierarchy, part_nodes(dataset))
@@ -331,8 +330,8 @@ def _stream(
                 block = dataset["displacement"].isel(sim=run, time=slice(begin, end)).values
             meter.add(block)
             write(run, begin, end, block[:, first.kept].astype(np.float32))
-        if progress:
-            progress(run + 1, runs)
+        if report:
+            report("interpolation errors", run + 1, runs, "")
     return meter.errors
 
 

@@ -73,6 +73,13 @@ class Epoch:
     validation_error: float = math.nan
     best_error: float = math.nan
 
+    def note(self) -> str:
+        """How good it is, in centimetres where there are validation runs."""
+        if math.isnan(self.validation_error):
+            return f"training loss {self.total:.2e}, no validation runs"
+        best = f"best {100 * self.best_error:.2f}, epoch {self.best_epoch}"
+        return f"validation {100 * self.validation_error:.2f} cm ({best})"
+
 
 class Keeper(Protocol):
     """Where a training's state goes between epochs; see `surrogates.training.checkpoints`."""

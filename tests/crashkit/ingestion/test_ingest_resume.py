@@ -411,12 +411,12 @@ def test_interrupt_leaves_what_is_finished(tmp_path: Path, memory: RunsInMemory)
     runs = [MemoryRun("a"), MemoryRun("b")]
     source = memory.put(tmp_path / "runs.txt", *runs)
 
-    def stop(done: int, total: int, note: str) -> None:
+    def stop(what: str, done: int, total: int, note: str) -> None:
         if done == 1:
             os.kill(os.getpid(), signal.SIGINT)
 
     with pytest.raises(KeyboardInterrupt):
-        ingest(source, tmp_path / "out.zarr", progress=stop)
+        ingest(source, tmp_path / "out.zarr", report=stop)
     assert ingest(source, tmp_path / "out.zarr").resumed == 1
 
 

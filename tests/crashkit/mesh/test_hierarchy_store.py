@@ -140,12 +140,12 @@ def test_a_failure_in_the_middle_leaves_the_old_hierarchy(path: Path, hierarchy:
     write_hierarchy(path, hierarchy)
     position, faces, _ = kart()
 
-    def stop(done: int, runs: int) -> None:
+    def stop(what: str, done: int, total: int, note: str) -> None:
         if done == 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_hierarchy(path, build_hierarchy(position, faces, [50]), progress=stop)
+        write_hierarchy(path, build_hierarchy(position, faces, [50]), report=stop)
     assert [level.n_nodes for level in read_hierarchy(path).levels] == [120, 30]
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 
@@ -158,7 +158,7 @@ def test_a_killed_process_leaves_the_dataset_and_the_next_one_succeeds(path: Pat
         "from pathlib import Path\n"
         "mesh = open_mesh(Path(sys.argv[1]))\n"
         "hierarchy = build_hierarchy(mesh.position, mesh.face_nodes, [50])\n"
-        "write_hierarchy(sys.argv[1], hierarchy, progress=lambda done, runs: os._exit(9) if done == 2 else None)\n"
+        "write_hierarchy(sys.argv[1], hierarchy, report=lambda what, done, total, note: os._exit(9) if done == 2 else None)\n"
     )
     assert subprocess.run([sys.executable, "-c", script, str(path)], check=False).returncode == 9
     with pytest.raises(DataError, match="has no mesh hierarchy"):
