@@ -29,6 +29,7 @@ from crashkit.campaign.study import Study, read_study
 from crashkit.campaign.table import Run, Table
 from data_schema.progress import Progress, silent
 
+_STARTING = 10.0  # seconds in which a job that was started has its lock
 _POLL = 0.2  # seconds between two looks at the jobs
 _DIGITS = 7  # of a parameter, so that deck, command and table say the same number
 _LOCK = ".lock"
@@ -177,20 +178,29 @@ class Campaign:
                 for command in filter(None, (self.study.prepare, self.study.command))
             ]
             job.give_order(place, commands, self.study.timeout)
+            # Noted before it is started: killed in between, the next start finds the job by its lock and does not start another.
+            self.table.change(run.name, "running", handle={}, attempts=run.attempts + 1, started=time.time(), reason="")
             handle = self.executor.start(place)
         except OSError as error:
+            self.table.change(run.name, "waiting", handle={}, attempts=run.attempts)
             raise CampaignError(
                 f"{place}: run {run.name} cannot be started ({error.strerror or error}); free space, then start the campaign again"
             ) from error
-        self.table.change(run.name, "running", handle=handle, attempts=run.attempts + 1, started=time.time(), reason="")
+        self.table.change(run.name, "running", handle=handle)
 
     def _settle(self) -> list[Run]:
         """Decide on running runs that have ended; returns those that go on."""
         going = []
         for run in self.table.runs("running"):
             ended = job.how_it_ended(self._place(run))
-            if ended is None and self.executor.alive(run.handle):
+            if ended is None and (self.executor.alive(run.handle) or job.is_running(self._place(run))):
                 going.append(run)
+                continue
+            if ended is None and not run.handle:  # the campaign was killed while it started this run
+                if time.time() - (run.started or 0.0) < _STARTING:
+                    going.append(run)
+                else:
+                    self.table.change(run.name, "waiting", attempts=max(0, run.attempts - 1))
                 continue
             ended = ended or job.how_it_ended(self._place(run))  # it may have ended between the two looks
             state, reason, found = self._judged(run, ended)

@@ -6,6 +6,7 @@ counts afterwards. All executors, here or on a cluster, start this one command.
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import signal
@@ -20,7 +21,7 @@ from typing import Any
 
 from crashkit import siblings
 
-LOG, ORDER, END = "run.log", "job.json", "exit.json"
+LOG, ORDER, END, LOCK = "run.log", "job.json", "exit.json", "job.lock"
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,26 @@ def start_command(folder: Path) -> list[str]:
     return siblings.command("crashkit.campaign.job", str(folder))
 
 
+def is_running(folder: Path) -> bool:
+    """Whether a job on this machine works in `folder` just now: it holds a lock while it does."""
+    if not (folder / LOCK).exists():
+        return False
+    with (folder / LOCK).open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            return True
+    return False
+
+
 def run(folder: Path) -> Ended:
     """Do the job in `folder` and note how it ended."""
+    with (folder / LOCK).open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        return _run(folder)
+
+
+def _run(folder: Path) -> Ended:
     order = json.loads((folder / ORDER).read_text(encoding="utf-8"))
     started = time.monotonic()
     ended = Ended(0, 0.0)
