@@ -145,7 +145,7 @@ def test_a_killed_campaign_goes_on_with_the_runs_that_went_on_without_it(
     child = subprocess.Popen([sys.executable, "-c", code, str(file), str(tmp_path / "out")])
     folder = tmp_path / "out" / "runs"
     deadline = time.monotonic() + 60
-    while len(list(folder.glob("*/job.json"))) < 2 and time.monotonic() < deadline:
+    while len(list(folder.glob("*/job.lock"))) < 2 and time.monotonic() < deadline:
         time.sleep(0.05)
     os.kill(child.pid, signal.SIGKILL)
     child.wait()
