@@ -216,7 +216,7 @@ WRONG_SOURCES = {
     "part": (lambda folder: demo_data(), ("--parts", "door"), "no part is called 'door'; the runs have 1 (kart)"),
     "field": (lambda folder: demo_data(), ("--fields", "stress"), "no run has a field 'stress'"),
     "table": (lambda folder: demo_data(), ("--params", "no.csv"), "no.csv: no such parameter table"),
-    "mesh": (lambda folder: demo_data(), ("--mesh", "no.vtp", "--reader", "d3plot"), "has no option 'mesh'"),
+    "mesh": (lambda folder: demo_data(), ("--mesh", "no.vtp"), "--mesh is no.vtp, which is no file"),
     "times": (lambda folder: demo_data(), ("--time", "0:1:5"), "the dataset's times are 0 to 1 s"),
     "no displacement": (
         lambda folder: unpacked(folder), ("--units", "SI"), "d3plot: has no displacements (IU = 0)",

@@ -153,8 +153,7 @@ def test_models_of_different_meshes_do_not_share_a_page(
     models: dict[str, tuple[Path, Surrogate]], tmp_path: Path
 ) -> None:
     other = train_surrogate(plate.campaign(10), settings("pod-gpr"))
-    assert other.points is not None
-    other.points = other.points[:-1]
+    other.points = other.faces = None
     save(other, tmp_path / "other")
     with pytest.raises(DataError, match="another mesh"):
         explore([models["mh"][0], tmp_path / "other"], tmp_path / "crash.html")
