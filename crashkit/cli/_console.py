@@ -6,7 +6,7 @@ import json
 import math
 import shlex
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -14,6 +14,8 @@ import typer
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from crashkit.cli._steps import Step
 
 
 def console(stderr: bool = False) -> Console:
@@ -41,6 +43,19 @@ def what_next(look: Path | str | None, *commands: Iterable[object]) -> None:
         say(f"look at  {look}")
     for command in commands:
         say("next     crashkit " + shlex.join(map(str, command)))
+
+
+def run_shown(todo: Sequence[Step], done_file: Path, fresh: bool) -> None:
+    """Run commands one after the other; what stops one of them, it has said itself."""
+    from crashkit.cli._steps import StepFailedError, run_steps
+
+    try:
+        run_steps(todo, done_file, fresh=fresh, say=say)
+    except StepFailedError as error:
+        fail(str(error), error.code)
+    except KeyboardInterrupt:
+        say("stopped; the same command goes on from there")
+        raise typer.Exit(130) from None
 
 
 def print_json(value: Any) -> None:

@@ -13,9 +13,22 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from crashkit import siblings
-from crashkit.cli._console import fail, say
-from crashkit.errors import OutputError
+from crashkit.errors import CrashkitError, OutputError
 from crashkit.version import __version__
+
+
+class StepFailedError(CrashkitError):
+    """A step ended with an error, about which its own output says more.
+
+    Attributes
+    ----------
+    code
+        Its exit code.
+    """
+
+    def __init__(self, number: int, code: int) -> None:
+        super().__init__(f"step {number} ended with code {code}; its message is above")
+        self.code = code
 
 
 @dataclass(frozen=True)
@@ -48,17 +61,34 @@ class Step:
     extends: Callable[[], bool] | None = None
 
 
-def run_steps(todo: Sequence[Step], done_file: Path, *, fresh: bool = False) -> None:
+def run_steps(
+    todo: Sequence[Step], done_file: Path, *, fresh: bool = False, say: Callable[[str], None] | None = None
+) -> None:
     """Run the steps in order. Those that ended well last time, unchanged and with the same version, are skipped.
 
-    Results are noted in `done_file` by name. A result that is there and not noted was made by somebody else, and is
-    refused instead of being replaced.
+    Results are noted in `done_file` by name. Ctrl-C reaches the running step, too, which is given the time to keep what it
+    has; the same call goes on from there.
+
+    Parameters
+    ----------
+    fresh
+        Make everything again.
+    say
+        Called with a sentence before each step; without it nothing is said.
+
+    Raises
+    ------
+    OutputError
+        For a result that is there and not noted: it was made by somebody else, and is not replaced.
+    StepFailedError
+        Where a step ends with an error.
     """
+    speak = say or (lambda sentence: None)
     noted = {name: "" if fresh else mark for name, mark in _noted(done_file).items()}
     renewed = False
     for number, step in enumerate(todo, 1):
         if step.result is None:
-            _say(number, todo, step, step.arguments)
+            speak(_heading(number, todo, step, step.arguments))
             _run(number, step.arguments)
             continue
         name = step.result.name
@@ -72,9 +102,9 @@ def run_steps(todo: Sequence[Step], done_file: Path, *, fresh: bool = False) -> 
         interrupted = step.result.with_name(f".{name}.training").exists() and noted.get(name) == f"begun {mark}"
         if interrupted:
             arguments += ("--resume",) if "--overwrite" in arguments else ("--resume", "--overwrite")
-        _say(number, todo, step, arguments)
+        speak(_heading(number, todo, step, arguments))
         if there and noted.get(name) == mark and (step.depends is not None or not renewed):
-            say("  (unchanged, done before; --fresh makes it again)")
+            speak("  (unchanged, done before; --fresh makes it again)")
             continue
         renewed = True
         asked = f"{name}: command"
@@ -86,8 +116,8 @@ def run_steps(todo: Sequence[Step], done_file: Path, *, fresh: bool = False) -> 
         _note(done_file, noted, name, _mark(step))
 
 
-def _say(number: int, todo: Sequence[Step], step: Step, arguments: Sequence[str]) -> None:
-    say(f"\n[{number}/{len(todo)}] {step.why}\n$ crashkit {shlex.join(arguments)}")
+def _heading(number: int, todo: Sequence[Step], step: Step, arguments: Sequence[str]) -> str:
+    return f"\n[{number}/{len(todo)}] {step.why}\n$ crashkit {shlex.join(arguments)}"
 
 
 def _mark(step: Step) -> str:
@@ -139,16 +169,16 @@ def _note(done_file: Path, noted: dict[str, str], name: str, mark: str) -> None:
 
 
 def _run(number: int, arguments: Sequence[str]) -> None:
-    """Run a command in a process of its own. Ctrl-C reaches it, too, and it is given the time to keep what it has."""
-    interrupted = False
+    """Run a command in a process of its own; after Ctrl-C, which it heard, too, wait until it has ended."""
+    interrupted: KeyboardInterrupt | None = None
     with subprocess.Popen(siblings.command("crashkit", *arguments), env=siblings.environment()) as process:
         while True:
             try:
                 code = process.wait()
                 break
-            except KeyboardInterrupt:
-                interrupted = True
-    if interrupted:
-        fail("interrupted; the same command goes on from there", code=130)
+            except KeyboardInterrupt as heard:
+                interrupted = heard
+    if interrupted is not None:
+        raise interrupted
     if code:
-        fail(f"step {number} ended with code {code}; its message stands above", code=code)
+        raise StepFailedError(number, code)

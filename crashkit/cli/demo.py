@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from crashkit.cli._console import say, table, what_next
-from crashkit.cli._steps import Step, run_steps
+from crashkit.cli._console import run_shown, say, table, what_next
+from crashkit.cli._steps import Step
 
 # As in the kart data's README: the first 27 of 36 runs train, the last 9 test.
 TEST_RUNS = "27:36"
@@ -84,7 +84,7 @@ def command(
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{output}: cannot be written ({error.strerror}); choose another folder with -o") from error
-    run_steps(steps(output, demo_data()), output / "done.json", fresh=fresh)
+    run_shown(steps(output, demo_data()), output / "done.json", fresh=fresh)
     show_result(output)
 
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from crashkit.cli._console import say, what_next
-from crashkit.cli._steps import Step, run_steps
+from crashkit.cli._console import run_shown, say, what_next
+from crashkit.cli._steps import Step
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -57,7 +57,7 @@ def command(
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{output}: cannot be written ({error.strerror}); choose another output") from error
-    run_steps(todo, output / "done.json", fresh=fresh)
+    run_shown(todo, output / "done.json", fresh=fresh)
     say("")
     if wanted.evaluate is not None:
         model = next(iter(wanted.train.models))

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
-import typer
 
-from crashkit.cli._steps import Step, run_steps
+from crashkit import siblings
+from crashkit.cli._steps import Step, StepFailedError, run_steps
 from crashkit.cli.demo import show_result, steps
 from crashkit.errors import OutputError
 
@@ -89,9 +93,9 @@ def test_a_moved_folder_is_as_good_as_before(tmp_path: Path, monkeypatch: pytest
 def test_a_failing_step_ends_with_its_code_and_is_not_noted_as_done(tmp_path: Path) -> None:
     done = tmp_path / "done.json"
     todo = [Step("bad", ("no-such-command",), tmp_path / "bad")]
-    with pytest.raises(typer.Exit) as caught:
+    with pytest.raises(StepFailedError, match="step 1 ended with code 2") as caught:
         run_steps(todo, done)
-    assert caught.value.exit_code == 2
+    assert caught.value.code == 2
     assert json.loads(done.read_text())["bad"].startswith("begun ")
 
 
@@ -112,3 +116,43 @@ def test_a_model_without_a_best_linear_compression_is_shown_all_the_same(
     show_result(tmp_path)
     (row,) = [line for line in capsys.readouterr().out.splitlines() if "POD-GPR" in line]
     assert row.replace("│", " ").replace("|", " ").split()[1:] == ["1.65", "8.11", "-"]
+
+
+INTERRUPTED = """
+import sys
+from pathlib import Path
+import typer
+from crashkit import siblings
+from crashkit.cli._console import run_shown
+from crashkit.cli._steps import Step
+
+STEP = '''
+import sys, time
+try:
+    print("ready", flush=True)
+    time.sleep(60)
+except KeyboardInterrupt:
+    print("error: interrupted", file=sys.stderr)
+    sys.exit(130)
+'''
+siblings.command = lambda *arguments: [sys.executable, "-c", STEP]
+try:
+    run_shown([Step("a long one", ("train",)), Step("the next", ("info",))], Path("done.json"), fresh=False)
+except typer.Exit as ended:
+    sys.exit(ended.exit_code)
+"""
+
+
+def test_ctrl_c_is_told_once_and_ends_all_steps(tmp_path: Path) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", INTERRUPTED], cwd=tmp_path, env=siblings.environment(), start_new_session=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the command and to its step
+        said = process.communicate(timeout=60)[1]
+    assert said.count("interrupted") == 1, said
+    assert said.splitlines()[-1] == "stopped; the same command goes on from there"
+    assert "[2/2]" not in said
+    assert process.returncode == 130
