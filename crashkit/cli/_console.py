@@ -15,7 +15,7 @@ import typer
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from crashkit.cli._steps import Step
+    from crashkit.api.steps import Step
 
 
 def console(stderr: bool = False) -> Console:
@@ -47,7 +47,7 @@ def what_next(look: Path | str | None, *commands: Iterable[object]) -> None:
 
 def run_shown(todo: Sequence[Step], done_file: Path, fresh: bool) -> None:
     """Run commands one after the other; what stops one of them, it has said itself."""
-    from crashkit.cli._steps import StepFailedError, run_steps
+    from crashkit.api.steps import StepFailedError, run_steps
 
     try:
         run_steps(todo, done_file, fresh=fresh, say=say)

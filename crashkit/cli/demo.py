@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
+from crashkit.api.steps import Step
 from crashkit.cli._console import run_shown, say, table, what_next
-from crashkit.cli._steps import Step
 
 # As in the kart data's README: the first 27 of 36 runs train, the last 9 test.
 TEST_RUNS = "27:36"

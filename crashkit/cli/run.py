@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from crashkit.api.steps import Step
 from crashkit.cli._console import run_shown, say, what_next
-from crashkit.cli._steps import Step
 
 if TYPE_CHECKING:
     from pydantic import BaseModel

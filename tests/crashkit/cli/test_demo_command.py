@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from crashkit import siblings
-from crashkit.cli._steps import Step, StepFailedError, run_steps
+from crashkit.api.steps import Step, StepFailedError, run_steps
 from crashkit.cli.demo import show_result, steps
 from crashkit.errors import OutputError
 
@@ -32,7 +32,7 @@ def run(todo: list[Step], done: Path, monkeypatch: pytest.MonkeyPatch, **more) -
         if result is not None:
             result.write_text("made")
 
-    monkeypatch.setattr("crashkit.cli._steps._run", write)
+    monkeypatch.setattr("crashkit.api.steps._run", write)
     run_steps(todo, done, **more)
     return made
 
@@ -74,7 +74,7 @@ def test_an_interrupted_training_goes_on(tmp_path: Path, monkeypatch: pytest.Mon
         (tmp_path / ".mh.training").mkdir()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("crashkit.cli._steps._run", interrupt)
+    monkeypatch.setattr("crashkit.api.steps._run", interrupt)
     with pytest.raises(KeyboardInterrupt):
         run_steps(todo, done)
     assert run(todo, done, monkeypatch) == ["mh --resume --overwrite"]
@@ -124,7 +124,7 @@ from pathlib import Path
 import typer
 from crashkit import siblings
 from crashkit.cli._console import run_shown
-from crashkit.cli._steps import Step
+from crashkit.api.steps import Step
 
 STEP = '''
 import sys, time
