@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 
 from crashkit import siblings
+from crashkit.api.demo import steps
 from crashkit.api.steps import Step, StepFailedError, run_steps
-from crashkit.cli.demo import show_result, steps
+from crashkit.cli.demo import show_result
 from crashkit.errors import OutputError
 
 

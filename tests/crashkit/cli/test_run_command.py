@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from crashkit.api.run_study import steps
 from crashkit.api.study import read_study
 from crashkit.cli import app
-from crashkit.cli.run import steps
 from crashkit.errors import CrashkitError
 
 STUDY = """
