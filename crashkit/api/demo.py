@@ -2,14 +2,83 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from crashkit.api.steps import Step
+from crashkit.api.steps import Step, run_steps
 
 # As in the kart data's README: the first 27 of 36 runs train, the last 9 test.
 TEST_RUNS = "27:36"
 # The paper keeps about 1/8, 1/4 and 1/4 of the nodes; the demo mesh has 2400.
 NODES = "300,75,19"
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """What the demo has made.
+
+    Attributes
+    ----------
+    performance
+        The table of the report, the largest error first: model, error_cm, worst_run_cm, pod_floor_cm.
+    files
+        What is worth opening, and what each is.
+    model
+        The folder of the finest model.
+    """
+
+    performance: list[dict[str, Any]]
+    files: dict[Path, str]
+    model: Path
+
+
+def run_demo(
+    output: str | Path = "demo", *, fresh: bool = False, say: Callable[[str], None] | None = None
+) -> DemoResult:
+    """From the embedded solver runs to a report, ParaView files and a page with sliders; only what is missing is made.
+
+    Parameters
+    ----------
+    output
+        Folder for everything.
+    fresh
+        Make everything again.
+    say
+        Called with a sentence before each step.
+
+    Raises
+    ------
+    OutputError
+        For a result in `output` that somebody else has made, or where it cannot be written.
+    StepFailedError
+        Where a step ends with an error.
+    """
+    from crashkit.dataset import demo_data
+
+    output = Path(output)
+    run_steps(steps(output, demo_data()), output, fresh=fresh, say=say)
+    return demo_result(output)
+
+
+def demo_result(output: Path) -> DemoResult:
+    """What a demo has left in `output`."""
+    from crashkit.api.describe import describe_report
+
+    rows = describe_report(output / "report")["performance"]
+    files = {
+        output / "crash.html": "sliders: change speed, angle and strength and see the crash, in a browser",
+        output / "report" / "report.html": "the report, in a browser",
+        output / "report" / "vtk": "truth, predictions and errors of two runs, in ParaView (.pvd)",
+        output / "new_crash.pvd": "a crash nobody computed, in ParaView",
+        output / "levels.png": "the meshes the surrogate works on",
+    }
+    return DemoResult(
+        sorted(rows, key=lambda row: -float(row["error_cm"])),
+        {path: what for path, what in files.items() if path.exists()},
+        output / "mh",
+    )
 
 
 def steps(output: Path, source: Path) -> list[Step]:

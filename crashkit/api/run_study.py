@@ -5,16 +5,75 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from crashkit.api.steps import Step
+from crashkit.api.steps import Step, run_steps
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
     from crashkit.api.study import Study
+
+
+@dataclass(frozen=True)
+class StudyResult:
+    """Where everything is that a study has made.
+
+    Attributes
+    ----------
+    output
+        The folder of the dataset, the models and the report.
+    models
+        The model folders, in the order of the study.
+    report
+        The page of the report; None where the study asks for none.
+    """
+
+    output: Path
+    models: tuple[Path, ...]
+    report: Path | None
+
+
+def run_study(study: str | Path, *, fresh: bool = False, say: Callable[[str], None] | None = None) -> StudyResult:
+    """Ingest, coarsen, train and evaluate as a YAML file says; what was done before and is unchanged is not done again.
+
+    Each step is a command in a process of its own, which shows its progress on the terminal.
+
+    Parameters
+    ----------
+    study
+        The YAML file; `crashkit run --help` shows one.
+    fresh
+        Make everything again.
+    say
+        Called with a sentence before each step.
+
+    Raises
+    ------
+    ReadError, DataError
+        For the file: what is wrong in it, and where.
+    OutputError
+        For a result that somebody else has made, or a folder that cannot be written.
+    StepFailedError
+        Where a step ends with an error.
+    """
+    from crashkit.api.study import read_study
+
+    wanted, home = read_study(study), Path(study).parent
+    output = home / wanted.output
+    run_steps(steps(wanted, home), output, fresh=fresh, say=say)
+    models = tuple(output / name for name in wanted.train.models)
+    return StudyResult(output, models, None if wanted.evaluate is None else output / "report" / "report.html")
+
+
+def study_steps(study: str | Path) -> list[Step]:
+    """The commands that `run_study` would run."""
+    from crashkit.api.study import read_study
+
+    return steps(read_study(study), Path(study).parent)
 
 
 def steps(study: Study, home: Path) -> list[Step]:

@@ -9,7 +9,7 @@ import os
 import shlex
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from crashkit import siblings
@@ -60,14 +60,19 @@ class Step:
     again: tuple[str, ...] = ()
     extends: Callable[[], bool] | None = None
 
+    @property
+    def line(self) -> str:
+        """The command as one would type it."""
+        return "crashkit " + shlex.join(self.arguments)
+
 
 def run_steps(
-    todo: Sequence[Step], done_file: Path, *, fresh: bool = False, say: Callable[[str], None] | None = None
+    todo: Sequence[Step], output: Path, *, fresh: bool = False, say: Callable[[str], None] | None = None
 ) -> None:
     """Run the steps in order. Those that ended well last time, unchanged and with the same version, are skipped.
 
-    Results are noted in `done_file` by name. Ctrl-C reaches the running step, too, which is given the time to keep what it
-    has; the same call goes on from there.
+    Results are noted by name in `done.json` in the folder `output`, which is made. Ctrl-C reaches the running step, too,
+    which is given the time to keep what it has; the same call goes on from there.
 
     Parameters
     ----------
@@ -79,16 +84,23 @@ def run_steps(
     Raises
     ------
     OutputError
-        For a result that is there and not noted: it was made by somebody else, and is not replaced.
+        For a result that is there and not noted: it was made by somebody else, and is not replaced. And where `output`
+        cannot be written.
     StepFailedError
         Where a step ends with an error.
     """
     speak = say or (lambda sentence: None)
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{output}: cannot be written ({error.strerror}); choose another output") from error
+    done_file = output / "done.json"
     noted = {name: "" if fresh else mark for name, mark in _noted(done_file).items()}
     renewed = False
     for number, step in enumerate(todo, 1):
+        heading = f"\n[{number}/{len(todo)}] {step.why}\n$ "
         if step.result is None:
-            speak(_heading(number, todo, step, step.arguments))
+            speak(f"{heading}{step.line}")
             _run(number, step.arguments)
             continue
         name = step.result.name
@@ -102,7 +114,7 @@ def run_steps(
         interrupted = step.result.with_name(f".{name}.training").exists() and noted.get(name) == f"begun {mark}"
         if interrupted:
             arguments += ("--resume",) if "--overwrite" in arguments else ("--resume", "--overwrite")
-        speak(_heading(number, todo, step, arguments))
+        speak(f"{heading}{replace(step, arguments=arguments).line}")
         if there and noted.get(name) == mark and (step.depends is not None or not renewed):
             speak("  (unchanged, done before; --fresh makes it again)")
             continue
@@ -114,10 +126,6 @@ def run_steps(
         with contextlib.nullcontext() if adds else _aside(step.result):
             _run(number, arguments)
         _note(done_file, noted, name, _mark(step))
-
-
-def _heading(number: int, todo: Sequence[Step], step: Step, arguments: Sequence[str]) -> str:
-    return f"\n[{number}/{len(todo)}] {step.why}\n$ crashkit {shlex.join(arguments)}"
 
 
 def _mark(step: Step) -> str:

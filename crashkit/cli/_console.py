@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import shlex
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -14,8 +15,6 @@ import typer
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-    from crashkit.api.steps import Step
 
 
 def console(stderr: bool = False) -> Console:
@@ -45,12 +44,13 @@ def what_next(look: Path | str | None, *commands: Iterable[object]) -> None:
         say("next     crashkit " + shlex.join(map(str, command)))
 
 
-def run_shown(todo: Sequence[Step], done_file: Path, fresh: bool) -> None:
-    """Run commands one after the other; what stops one of them, it has said itself."""
-    from crashkit.api.steps import StepFailedError, run_steps
+@contextlib.contextmanager
+def steps_shown() -> Iterator[None]:
+    """Around commands that run one after the other: what stops one of them, it has said itself."""
+    from crashkit.api.steps import StepFailedError
 
     try:
-        run_steps(todo, done_file, fresh=fresh, say=say)
+        yield
     except StepFailedError as error:
         fail(str(error), error.code)
     except KeyboardInterrupt:
@@ -88,6 +88,11 @@ def table(title: str, columns: Iterable[str], rows: Iterable[Iterable[object]]) 
     for row in rows:
         out.add_row(*(Text(str(cell)) for cell in row))
     console().print(out)
+
+
+def fixed(value: float | None, digits: int) -> str:
+    """A number for a table; a dash where there is none."""
+    return "-" if value is None or value != value else f"{value:.{digits}f}"
 
 
 def numbers(text: str, option: str, example: str, *, whole: bool = False) -> list[Any]:

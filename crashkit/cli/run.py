@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from crashkit.cli._console import run_shown, say, what_next
+from crashkit.cli._console import say, steps_shown, what_next
 
 _EXAMPLE = """\b
 A study.yaml (paths are relative to it):
@@ -31,30 +31,19 @@ def command(
 
     Ingest, coarsen, train and evaluate, as often as you like: only what changed is done again.
     """
-    from crashkit.api.run_study import steps
-    from crashkit.api.study import read_study
-    from crashkit.errors import OutputError
+    from crashkit.api.run_study import run_study, study_steps
 
-    wanted = read_study(study)
-    todo = steps(wanted, study.parent)
     if dry:
-        import shlex
-
-        for step in todo:
-            typer.echo("crashkit " + shlex.join(step.arguments))
+        for step in study_steps(study):
+            typer.echo(step.line)
         return
-    output = study.parent / wanted.output
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{output}: cannot be written ({error.strerror}); choose another output") from error
-    run_shown(todo, output / "done.json", fresh=fresh)
+    with steps_shown():
+        result = run_study(study, fresh=fresh, say=say)
     say("")
-    if wanted.evaluate is not None:
-        model = next(iter(wanted.train.models))
-        what_next(output / "report" / "report.html", ("predict", output / model, "--param", "NAME=VALUE"))
+    if result.report is not None:
+        what_next(result.report, ("predict", result.models[0], "--param", "NAME=VALUE"))
     else:
-        what_next(output, ("info", output / next(iter(wanted.train.models))))
+        what_next(result.output, ("info", result.models[0]))
 
 
 command.__doc__ = f"{inspect.cleandoc(command.__doc__ or '')}\n\n{_EXAMPLE}\n"

@@ -63,7 +63,7 @@ def test_a_script_gets_our_packages(folder: Path) -> None:
 
 
 def test_commands_work_there_and_say_nothing_of_it(folder: Path, demo_dataset: Path) -> None:
-    done = in_folder(folder, "-m", "crashkit", "info", demo_dataset)
+    done = in_folder(folder, "-m", "crashkit", "info", "--json", demo_dataset)  # --json: no progress
     assert (done.returncode, done.stderr) == (0, "")
     assert "impact_speed" in done.stdout
 
@@ -71,7 +71,7 @@ def test_commands_work_there_and_say_nothing_of_it(folder: Path, demo_dataset: P
 def test_the_steps_of_demo_and_run_work_there(tmp_path: Path, demo_dataset: Path) -> None:
     for name in (*NAMES, "xarray", "typer"):  # those of the libraries we use, too
         as_file(tmp_path, name)
-    code = "import sys; del sys.path[0]; from crashkit.api.steps import _run; _run(1, ['info', sys.argv[1]])"
+    code = "import sys; del sys.path[0]; from crashkit.api.steps import _run; _run(1, ['info', '--json', sys.argv[1]])"
     done = in_folder(tmp_path, "-c", code, demo_dataset)
     assert (done.returncode, done.stderr) == (0, "")
 

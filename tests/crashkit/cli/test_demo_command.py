@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from crashkit import siblings
-from crashkit.api.demo import steps
+from crashkit.api.demo import demo_result, steps
 from crashkit.api.steps import Step, StepFailedError, run_steps
-from crashkit.cli.demo import show_result
+from crashkit.cli.demo import show
 from crashkit.errors import OutputError
 
 
@@ -23,7 +23,7 @@ def _step(folder: Path, name: str, **more) -> Step:
     return Step(name, ("export", "--help"), folder / name, **more)
 
 
-def run(todo: list[Step], done: Path, monkeypatch: pytest.MonkeyPatch, **more) -> list[str]:
+def run(todo: list[Step], output: Path, monkeypatch: pytest.MonkeyPatch, **more) -> list[str]:
     """Run the steps, the commands replaced by writing the result; gives the names of those that were run."""
     made = []
 
@@ -34,42 +34,41 @@ def run(todo: list[Step], done: Path, monkeypatch: pytest.MonkeyPatch, **more) -
             result.write_text("made")
 
     monkeypatch.setattr("crashkit.api.steps._run", write)
-    run_steps(todo, done, **more)
+    run_steps(todo, output, **more)
     return made
 
 
 def test_a_step_done_before_is_not_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    todo, done = [_step(tmp_path, "a", again=("--overwrite",))], tmp_path / "done.json"
-    assert run(todo, done, monkeypatch) == ["a"]
-    assert run(todo, done, monkeypatch) == []
-    assert run(todo, done, monkeypatch, fresh=True) == ["a --overwrite"]
+    todo = [_step(tmp_path, "a", again=("--overwrite",))]
+    assert run(todo, tmp_path, monkeypatch) == ["a"]
+    assert run(todo, tmp_path, monkeypatch) == []
+    assert run(todo, tmp_path, monkeypatch, fresh=True) == ["a --overwrite"]
 
 
 def test_what_stands_behind_a_renewed_step_is_renewed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    todo, done = [_step(tmp_path, "a"), _step(tmp_path, "b")], tmp_path / "done.json"
-    run(todo, done, monkeypatch)
+    todo = [_step(tmp_path, "a"), _step(tmp_path, "b")]
+    run(todo, tmp_path, monkeypatch)
     (tmp_path / "a").unlink()
-    assert run(todo, done, monkeypatch) == ["a", "b"]
+    assert run(todo, tmp_path, monkeypatch) == ["a", "b"]
 
 
 def test_only_what_depends_on_a_change_is_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     known = {"a": "1", "b": "1"}
     todo = [_step(tmp_path, n, depends=lambda n=n: known[n]) for n in known]
-    done = tmp_path / "done.json"
-    run(todo, done, monkeypatch)
+    run(todo, tmp_path, monkeypatch)
     known["b"] = "2"
-    assert run(todo, done, monkeypatch) == ["b"]
+    assert run(todo, tmp_path, monkeypatch) == ["b"]
 
 
 def test_a_result_of_somebody_else_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a").write_text("years of work")
     with pytest.raises(OutputError, match="was not made by this command"):
-        run([_step(tmp_path, "a")], tmp_path / "done.json", monkeypatch)
+        run([_step(tmp_path, "a")], tmp_path, monkeypatch)
     assert (tmp_path / "a").read_text() == "years of work"
 
 
 def test_an_interrupted_training_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    todo, done = [_step(tmp_path, "mh", again=("--overwrite",))], tmp_path / "done.json"
+    todo = [_step(tmp_path, "mh", again=("--overwrite",))]
 
     def interrupt(number: int, arguments) -> None:
         (tmp_path / ".mh.training").mkdir()
@@ -77,27 +76,26 @@ def test_an_interrupted_training_goes_on(tmp_path: Path, monkeypatch: pytest.Mon
 
     monkeypatch.setattr("crashkit.api.steps._run", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        run_steps(todo, done)
-    assert run(todo, done, monkeypatch) == ["mh --resume --overwrite"]
+        run_steps(todo, tmp_path)
+    assert run(todo, tmp_path, monkeypatch) == ["mh --resume --overwrite"]
 
 
 def test_a_moved_folder_is_as_good_as_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "old").mkdir()
     step = Step("a", ("export", "--help", str(tmp_path / "old" / "in")), tmp_path / "old" / "a")
-    run([step], tmp_path / "old" / "done.json", monkeypatch)
+    run([step], tmp_path / "old", monkeypatch)
     assert "old" not in (tmp_path / "old" / "done.json").read_text()
     (tmp_path / "old").rename(tmp_path / "new")
     step = Step("a", ("export", "--help", str(tmp_path / "new" / "in")), tmp_path / "new" / "a")
-    assert run([step], tmp_path / "new" / "done.json", monkeypatch) == []
+    assert run([step], tmp_path / "new", monkeypatch) == []
 
 
 def test_a_failing_step_ends_with_its_code_and_is_not_noted_as_done(tmp_path: Path) -> None:
-    done = tmp_path / "done.json"
     todo = [Step("bad", ("no-such-command",), tmp_path / "bad")]
     with pytest.raises(StepFailedError, match="step 1 ended with code 2") as caught:
-        run_steps(todo, done)
+        run_steps(todo, tmp_path)
     assert caught.value.code == 2
-    assert json.loads(done.read_text())["bad"].startswith("begun ")
+    assert json.loads((tmp_path / "done.json").read_text())["bad"].startswith("begun ")
 
 
 def test_every_command_of_the_demo_is_public(tmp_path: Path) -> None:
@@ -114,7 +112,7 @@ def test_a_model_without_a_best_linear_compression_is_shown_all_the_same(
     (tmp_path / "report").mkdir()
     rows = [{"model": "POD-GPR", "error_cm": 1.649, "worst_run_cm": 8.113, "pod_floor_cm": None}]
     (tmp_path / "report" / "report.json").write_text(json.dumps({"performance": rows}))
-    show_result(tmp_path)
+    show(demo_result(tmp_path))
     (row,) = [line for line in capsys.readouterr().out.splitlines() if "POD-GPR" in line]
     assert row.replace("│", " ").replace("|", " ").split()[1:] == ["1.65", "8.11", "-"]
 
@@ -124,8 +122,8 @@ import sys
 from pathlib import Path
 import typer
 from crashkit import siblings
-from crashkit.cli._console import run_shown
-from crashkit.api.steps import Step
+from crashkit.cli._console import say, steps_shown
+from crashkit.api.steps import Step, run_steps
 
 STEP = '''
 import sys, time
@@ -138,7 +136,8 @@ except KeyboardInterrupt:
 '''
 siblings.command = lambda *arguments: [sys.executable, "-c", STEP]
 try:
-    run_shown([Step("a long one", ("train",)), Step("the next", ("info",))], Path("done.json"), fresh=False)
+    with steps_shown():
+        run_steps([Step("a long one", ("train",)), Step("the next", ("info",))], Path(), say=say)
 except typer.Exit as ended:
     sys.exit(ended.exit_code)
 """
