@@ -1,7 +1,9 @@
 """Chunks of a Zarr store: each carries a checksum, and those that are damaged or lost are named.
 
 Zarr takes a lost chunk for one that was never written, and gives NaN or zero in its place. The stores of this package
-write every chunk, so that a file that is not there is a loss; runs without an array are listed in its attributes.
+write every chunk, so that a file that is not there is a loss; runs without an array are listed in its attributes. They
+are known by how chunks are called: what a user stores with xarray (`ds.isel(sim=...).to_zarr(path)`) keeps the codecs, but
+calls its chunks otherwise and leaves out those that hold fill values alone.
 """
 
 from __future__ import annotations
@@ -101,10 +103,12 @@ def damaged_chunk(store: Path, runs: Sequence[str] = ()) -> str | None:
 
 
 def _about(array: Path) -> tuple[list[int], list[int], list[str], dict[str, Any]] | None:
-    """Shape, chunks, dimensions and attributes; None of a group, and of an array whose chunks carry no checksum."""
+    """Shape, chunks, dimensions and attributes; None of a group, and of an array that was not written by this package."""
     try:
         found = json.loads((array / "zarr.json").read_text())
         if found.get("node_type") != "array" or CHECKSUM not in [c["name"] for c in found["codecs"]]:
+            return None
+        if found["chunk_key_encoding"].get("configuration", {}).get("separator") != KEYS["separator"]:
             return None
         chunks = found["chunk_grid"]["configuration"]["chunk_shape"]
         return found["shape"], chunks, found.get("dimension_names") or [], found.get("attributes") or {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import shutil
+import warnings
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from crashkit.api.campaign import open_campaign
 from crashkit.api.coarsen import coarsen
 from crashkit.api.describe import describe_dataset
 from crashkit.api.source import source_of
+from crashkit.api.validate import validate
 from crashkit.dataset import open_dataset, reading_dataset
 from crashkit.errors import ReadError
 from crashkit.mesh.store import level_displacement
@@ -70,6 +72,18 @@ def test_run_and_chunk_are_named(coarsened: Path) -> None:
     finally:
         chunk.write_bytes(before)
     read_all(coarsened)
+
+
+def test_runs_that_a_user_stores_with_xarray_are_a_dataset(coarsened: Path, tmp_path: Path) -> None:
+    """Chunks of zeros are left out by xarray: they are zeros, not lost."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Zarr 3 does not specify how texts are stored
+        with open_dataset(coarsened) as whole:
+            whole.isel(sim=slice(1, 4)).to_zarr(tmp_path / "some.zarr")
+    assert validate(tmp_path / "some.zarr") == []
+    with open_dataset(tmp_path / "some.zarr") as some, open_dataset(coarsened) as whole:
+        assert some.displacement.equals(whole.displacement.isel(sim=slice(1, 4)))
+        assert some.alignment_error.values.tolist() == [0.0] * 3
 
 
 def test_a_flipped_bit_in_netcdf_values_is_refused(tmp_path: Path) -> None:
