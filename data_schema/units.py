@@ -66,6 +66,11 @@ def si_unit(quantity: str) -> str:
     return _quantity(quantity)[1]
 
 
+def quantity_in(unit: str) -> str:
+    """The first quantity that `unit`, a label of SI as `to_si` gives it, measures; "unknown" where none does."""
+    return next((name for name, (_, label) in _QUANTITIES.items() if label == unit), "unknown")
+
+
 def _quantity(name: str) -> tuple[tuple[int, int, int], str]:
     if name not in _QUANTITIES:
         raise UnknownUnits(f"quantity {name!r} is not known; known are {', '.join(_QUANTITIES)}")

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
+from crashkit.readers._checks import reading
 from data_schema import UnknownUnits, si_unit, unit_system
 
 if TYPE_CHECKING:
@@ -43,7 +44,8 @@ def write_curves(run: Run, units: str, folder: Path) -> None:
         Where the run has curves that cannot be read.
     """
     try:
-        history = run.history()
+        with reading(f"run {run.name}, its time histories"):
+            history = run.history()
     except ReadError as error:
         raise ReadError(f"{error}; or move the file away to ingest the run without its curves") from error
     if history is None:

@@ -258,8 +258,7 @@ class _Transfer:
 
     def _file(self, state: int) -> str:
         """The file that holds a state, as far as that can be told."""
-        files = self._found.files
-        return str(files[state] if len(files) >= len(self._own) > 1 else files[0] if files else self._found.source)
+        return str(self._view.run.file_of(state) if self._found.files else self._found.source)
 
     # Erosion
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
-from crashkit.readers.history import Channel, History, distinct
+from crashkit.readers.history import Channel, History, distinct, quantity_of
 
 # Databases that are read, in this order; the first one that is there gives the times.
 _DATABASES = (
@@ -46,11 +46,6 @@ _NO_CURVE = {
     "version_number",
     "state",
 }
-_WORDS = {
-    "energy": "energy", "work": "energy", "momentum": "momentum", "force": "force", "moment": "moment",
-    "displacement": "length", "coordinate": "length", "velocity": "velocity", "acceleration": "acceleration",
-    "mass": "mass", "volume": "volume", "pressure": "stress", "time_step": "time", "ratio": "one",
-}  # fmt: skip
 
 
 def binout_files(folder: Path) -> list[Path]:
@@ -151,17 +146,8 @@ def _curves(
             continue
         numbers = values.astype(np.float64)
         if numbers.ndim == 1:
-            yield Channel(f"{database}_{key}", _quantity(key)), numbers
+            yield Channel(f"{database}_{key}", quantity_of(key)), numbers
         elif numbers.ndim == 2:
             objects = ids if ids is not None and len(ids) == numbers.shape[1] else range(1, numbers.shape[1] + 1)
             for k, number in enumerate(objects):
-                yield Channel(f"{database}_{int(number)}_{key}", _quantity(key)), numbers[:, k]
-
-
-def _quantity(key: str) -> str:
-    """What a curve measures, told by its last word that is known; nodout's rx_velocity and the like are rotations."""
-    for word, quantity in reversed(_WORDS.items()):
-        if word in key:
-            turns = key[:2] in ("rx", "ry", "rz") and quantity in ("velocity", "acceleration")
-            return {"velocity": "one/time", "acceleration": "one/time2"}[quantity] if turns else quantity
-    return "unknown"
+                yield Channel(f"{database}_{int(number)}_{key}", quantity_of(key)), numbers[:, k]

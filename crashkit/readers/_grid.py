@@ -82,6 +82,10 @@ class GridSource(ABC):
     @abstractmethod
     def place(self, state: int) -> str: ...
 
+    def file_of(self, state: int) -> Path:
+        """The file that holds a state."""
+        return self.files[0]
+
     def close(self) -> None:  # noqa: B027 - most sources hold nothing open
         """Let go of files."""
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -249,6 +250,9 @@ class GridRun(Run):
                 f"expected {self._shapes[kind, name]} as in the first state"
             )
         return found
+
+    def file_of(self, state: int) -> Path:
+        return self._source.file_of(state)
 
     def close(self) -> None:
         self._source.close()

@@ -107,6 +107,16 @@ def read_history(file: Path) -> History:
         Where it is none, or where its head is damaged.
     """
     records = _Records(file)
+    try:
+        return _history(file, records)
+    except struct.error as error:
+        raise ReadError(
+            f"{file}: the record before byte {records.place} of {len(records.data)} is shorter than its kind ({error}); the "
+            "file is cut short or damaged, copy it again"
+        ) from error
+
+
+def _history(file: Path, records: _Records) -> History:
     head = records.next("the title")
     (version,) = struct.unpack_from(">i", head.ljust(4, b"\0"))
     if not 2000 <= version <= 9999:

@@ -155,6 +155,10 @@ class Run(ABC):
         """
         return None
 
+    def file_of(self, state: int) -> Path:
+        """The file that holds a state, for messages; the first one where a reader does not know better."""
+        return self.files[0]
+
     def close(self) -> None:  # noqa: B027 - most readers hold nothing open
         """Let go of files."""
 

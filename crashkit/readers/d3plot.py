@@ -147,7 +147,8 @@ class _D3plotRun(Run):
         self.parameters: Mapping[str, Parameter] = {}
         decks = sorted(p for p in first.parent.iterdir() if p.suffix.lower() in _DECK_SUFFIXES and p.is_file())
         self.end_time = _end_time(decks)
-        self.files = (first, *family.values())
+        self._curves = binout_files(first.parent)
+        self.files = (first, *family.values(), *self._curves)
         self.problems = (
             *_gaps(first, tuple(family)),
             *_adapted(first),
@@ -157,8 +158,10 @@ class _D3plotRun(Run):
 
     def history(self) -> History | None:
         """The curves of the binout family beside the d3plot, where there is one."""
-        files = binout_files(self.files[0].parent)
-        return read_binout(files) if files else None
+        return read_binout(self._curves) if self._curves else None
+
+    def file_of(self, state: int) -> Path:
+        return self._file.states[state].file
 
     def _place(self, state: int) -> str:
         at = self._file.states[state]

@@ -7,13 +7,13 @@
     kart/alive                    (run, state, face), 0 once an element has eroded
     kart/part, part_id, part_name (face,) place among the parts, (part,) their numbers and (part,) titles
     kart/node_id, element_id      (node,), (face,) the solver's numbers
-    history/<curve>               (run, sample), with attribute `units`; history/time (sample,) or (run, sample)
+    history/<curve>               (run, sample); history/time (sample,) or (run, sample), s where the file is in SI
     run                           (run,) the campaign's own numbers, which name the runs
     parameter                     (run, parameter), with attributes `names` and `units`
     time                          (state,), or (run, state); where it is missing, the option `time_step` gives it
 
-Any group name will do. Lengths in metre are told by the attribute `units` of the displacements; then the unit
-system is SI, else the user must say.
+Any group name will do. Lengths in metre are known by the attribute `units` of the displacements; then the unit
+system is SI, else the user must say. In a file in SI a curve may have a unit of its own in its attribute `units` (kN).
 
 The public file has no names of parameters. Where the group is called `kart` and `parameter` has three columns
 without names, they are taken to be that campaign's: impact_speed in m/s, impact_angle in degree, yield_stress in MPa.
@@ -44,7 +44,9 @@ from crashkit.readers._hdf5_data import files_behind
 from crashkit.readers._names import quantity
 from crashkit.readers._parameters import parameter_columns
 from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh, Runs
-from crashkit.readers.history import Channel, History
+from crashkit.readers.history import Channel, History, quantity_of
+from data_schema import UnknownUnits, si_unit, to_si
+from data_schema.units import quantity_in
 
 if TYPE_CHECKING:
     import h5py
@@ -52,10 +54,6 @@ if TYPE_CHECKING:
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 _NEEDED = ("displacements", "reference_configuration")
 _KART_PARAMETERS = (("impact_speed", "m s-1"), ("impact_angle", "degree"), ("yield_stress", "MPa"))
-_CURVES = {
-    "energy": "energy", "work": "energy", "momentum": "momentum", "force": "force", "moment": "moment",
-    "acceleration": "acceleration", "velocity": "velocity", "displacement": "length", "mass": "mass",
-}  # fmt: skip
 _METRE = ("m", "metre", "meter")
 # One chunk may hold all states of a run; the cache keeps it while its states are read slice by slice.
 _CHUNK_CACHE = 96 << 20
@@ -383,23 +381,28 @@ class _KartRun(Run):
         names = [n for n in curves if n != "time"]
         time = curves["time"]
         times = self._campaign.read(time, *((self._index,) if time.ndim == 2 else (...,))).astype(np.float64)
-        channels = tuple(Channel(n, _curve_quantity(n)) for n in names)
         values = [self._campaign.read(curves[n], self._index).astype(np.float64) for n in names]
-        return History(times, channels, np.stack(values, axis=1))
+        told = [self._unit_of(curves[n], n) for n in names]
+        channels = tuple(Channel(n, quantity) for n, (quantity, _) in zip(names, told, strict=True))
+        return History(times, channels, np.stack(values, axis=1) * [factor for _, factor in told])
+
+    def _unit_of(self, curve: h5py.Dataset, name: str) -> tuple[str, float]:
+        """What a curve measures, and its value in SI where the file is in SI and the curve says its unit: (force, 1000)."""
+        unit = _text(curve.attrs.get("units", ""))
+        if not unit or self.units != "SI":
+            return quantity_of(name), 1.0
+        try:
+            factor, si = to_si(unit)
+        except UnknownUnits as error:
+            raise ReadError(f"{self._campaign.path}: {curve.name}: {error}") from error
+        known = quantity_of(name)
+        return (known if known != "unknown" and si_unit(known) == si else quantity_in(si)), factor
 
     def field(self, name: str, first: int, last: int) -> NDArray[np.float32]:
         if name not in self.fields:
             raise KeyError(name)
         dataset = self._campaign.file[self._campaign.group][name]
         return self._campaign.read(dataset, self._index, slice(first, last)).astype(np.float32, copy=False)
-
-
-def _curve_quantity(name: str) -> str:
-    """What a curve measures, told by its name: "wall_force_x" is a force."""
-    for word, kind in _CURVES.items():
-        if word in name:
-            return kind
-    return "unknown"
 
 
 def _text(value: object) -> str:

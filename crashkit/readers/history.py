@@ -9,6 +9,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 
+# What curves measure, by the words in their names.
+_QUANTITIES = {
+    "energy": "energy", "work": "energy", "momentum": "momentum", "force": "force", "moment": "moment",
+    "displacement": "length", "coordinate": "length", "velocity": "velocity", "acceleration": "acceleration",
+    "mass": "mass", "volume": "volume", "pressure": "stress", "time_step": "time", "ratio": "one",
+}  # fmt: skip
+# Of rotations the same words mean angles.
+_TURNS = {"length": "one", "velocity": "one/time", "acceleration": "one/time2"}
+
+
+def quantity_of(name: str) -> str:
+    """What a curve measures, by the last word in its name that is known: "wall_force_x" is a force, "x_momentum" no moment.
+
+    `rx_velocity` and the like are rotations. "unknown" where no word is known, and where something is given per
+    something else ("energy_per_mass").
+    """
+    words = {(name.rfind(word) + len(word), len(word)): kind for word, kind in _QUANTITIES.items() if word in name}
+    if not words or "_per_" in name:
+        return "unknown"
+    kind = words[max(words)]
+    return _TURNS.get(kind, kind) if name[:2] in ("rx", "ry", "rz") else kind
+
+
 @dataclass(frozen=True)
 class Channel:
     """One curve. `quantity` names what it measures for the change to SI, as in `data_schema.units`.

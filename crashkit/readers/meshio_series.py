@@ -230,6 +230,9 @@ class _Files(WholeStates):
     def place(self, state: int) -> str:
         return f"{self.files[state]}, state {state}"
 
+    def file_of(self, state: int) -> Path:
+        return self.files[state]
+
     def read(self, state: int) -> Grid:
         file = self.files[state]
         need(f"reading {file}", "formats")

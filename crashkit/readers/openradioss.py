@@ -110,7 +110,9 @@ class _RadiossRun(Run):
         self.mesh = self._read_mesh()
         self.parameters: Mapping[str, Parameter] = {}
         decks = deck.decks(self._states[0].parent, self._root)
-        self.files = (*self._states, *decks)
+        curves = self._states[0].with_name(f"{self._root}T01")
+        self._curves = curves if curves.is_file() else None
+        self.files = (*self._states, *decks, *([self._curves] if self._curves is not None else []))
         self.units = deck.units(decks)
         self.end_time = deck.end_time(decks)
         self.problems = (*self._gaps(), *time_problems(self.time, self._states), *self._start())
@@ -121,9 +123,11 @@ class _RadiossRun(Run):
         return match["root"] if match else ""
 
     def history(self) -> History | None:
-        """The curves of NAMET01, where it stands beside the animation files."""
-        file = self._states[0].with_name(f"{self._root}T01")
-        return read_history(file) if file.is_file() else None
+        """The curves of NAMET01, where it is beside the animation files."""
+        return read_history(self._curves) if self._curves is not None else None
+
+    def file_of(self, state: int) -> Path:
+        return self._states[state]
 
     # Files
 

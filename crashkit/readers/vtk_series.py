@@ -218,7 +218,10 @@ class FileSeries(WholeStates):
         self.files = tuple(dict.fromkeys((*(() if index is None else (index,)), *named, *behind)))
 
     def place(self, state: int) -> str:
-        return f"{self._states[state][0].file}, state {state}"
+        return f"{self.file_of(state)}, state {state}"
+
+    def file_of(self, state: int) -> Path:
+        return self._states[state][0].file
 
     def read(self, state: int) -> Grid:
         listed = self._states[state]

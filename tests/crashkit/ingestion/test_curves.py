@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -34,6 +35,7 @@ def test_curves_stand_beside_their_run_and_are_missing_where_a_run_has_none(runs
     assert str(data["channel_unit"].sel(channel="kinetic_energy").values) == "J"
     assert "impulse" in str(data["channel_note"].sel(channel="pole_normal_force_x").values)
     assert float(data["history_time"].sel(sim="two")[1]) == pytest.approx(1.008e-4, rel=1e-3)
+    assert "kartT01" in [e["file"] for e in json.loads(data.attrs["source_files"]) if e["run"] == "two"]
 
 
 def test_appended_runs_keep_the_curves_that_are_there(runs: Path, tmp_path: Path) -> None:

@@ -207,6 +207,29 @@ def test_curves_of_the_file_have_what_they_measure(whole):
     assert history.values[:, energy].tolist() == [5.0, 6.0, 7.0, 8.0, 9.0]
 
 
+def test_a_curve_with_a_unit_of_its_own_comes_in_the_unit_of_the_file(whole):
+    with h5py.File(whole, "a") as file:
+        file["kart/displacements"].attrs["units"] = "m"
+        file["history/wall_force_x"].attrs["units"] = "kN"
+        file["history/sled_intrusion"] = np.ones((2, 5))
+        file["history/sled_intrusion"].attrs["units"] = "mm"
+    history = read(whole)[1].history()
+    assert {c.name: c.quantity for c in history.channels} == {
+        "internal_energy": "energy", "wall_force_x": "force", "sled_intrusion": "length",
+    }  # fmt: skip
+    force, intrusion = ([c.name for c in history.channels].index(n) for n in ("wall_force_x", "sled_intrusion"))
+    assert history.values[:, force].tolist() == [-5000.0, -6000.0, -7000.0, -8000.0, -9000.0]
+    assert history.values[0, intrusion] == 0.001
+
+
+def test_a_curve_in_a_unit_that_is_not_known_is_refused(whole):
+    with h5py.File(whole, "a") as file:
+        file["kart/displacements"].attrs["units"] = "m"
+        file["history/wall_force_x"].attrs["units"] = "blah"
+    with pytest.raises(ReadError, match="history/wall_force_x: unit 'blah' is not known"):
+        read(whole)[1].history()
+
+
 def test_what_is_not_read_is_named(whole):
     assert read(whole)[0].left_out == ("pole_x",)
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from crashkit.errors import ReadError
 from crashkit.readers._binout import binout_files, read_binout
 from crashkit.readers._radioss_history import read_history
-from crashkit.readers.history import Channel, History, distinct
+from crashkit.readers.history import Channel, History, distinct, quantity_of
 
 # Byte of the file behind its first sample.
 FIRST_SAMPLE_ENDS = 3332
@@ -85,6 +85,47 @@ def test_a_cut_head_is_refused_with_its_place(cut: int) -> None:
         file.write_bytes(T01.read_bytes()[:cut])
         with pytest.raises(ReadError, match="cutT01"):
             read_history(file)
+
+
+@given(st.integers(min_value=0, max_value=2700), st.integers(min_value=0, max_value=255))
+def test_a_wrong_byte_in_the_head_is_one_line_or_nothing(place: int, byte: int) -> None:
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "wrongT01"
+        content = bytearray(T01.read_bytes())
+        content[place] = byte
+        file.write_bytes(content)
+        try:
+            read_history(file)
+        except ReadError as error:
+            assert "wrongT01" in str(error)
+
+
+def test_a_group_record_that_is_too_short_is_one_line(tmp_path: Path) -> None:
+    file = tmp_path / "shortT01"
+    records = [struct.pack(">i", 4021) + bytes(100), b"date", b"", b"", b"", struct.pack(">6i", 0, 0, 0, 0, 1, 0), b"1234"]
+    file.write_bytes(b"".join(struct.pack(">i", len(r)) + r + struct.pack(">i", len(r)) for r in records))
+    with pytest.raises(ReadError, match=r"shortT01: the record before byte .* is shorter than its kind"):
+        read_history(file)
+
+
+@pytest.mark.parametrize(
+    ("name", "quantity"),
+    [
+        ("x_momentum", "momentum"),
+        ("moment_z", "moment"),
+        ("energy_ratio", "one"),
+        ("pole_normal_force_x", "force"),
+        ("external_work", "energy"),
+        ("rx_velocity", "one/time"),
+        ("rx_displacement", "one"),
+        ("energy_per_mass", "unknown"),
+        ("cycle_count", "unknown"),
+    ],
+)
+def test_the_last_known_word_says_what_a_curve_measures(name: str, quantity: str) -> None:
+    assert quantity_of(name) == quantity
 
 
 def test_what_is_no_history_is_refused(tmp_path: Path) -> None:

@@ -268,6 +268,7 @@ def test_a_missing_file_of_a_collection_is_a_problem(tmp_path, only_run, sample)
     run = only_run(tmp_path / "run.pvd")
     assert run.problems == (f"{tmp_path / 'run.pvd'}: 1 of the files it lists are missing: run_001.vtu",)
     np.testing.assert_array_equal(run.displacement(0, 2), sample.displacement[[0, 2]])
+    assert [run.file_of(state).name for state in (0, 1)] == ["run_000.vtu", "run_002.vtu"]
 
 
 def test_a_missing_number_is_a_problem(tmp_path, only_run, sample):
