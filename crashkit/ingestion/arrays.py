@@ -189,7 +189,7 @@ def _parameters(
     given: Mapping[str, ArrayLike], units: Mapping[str, str], sizes: Mapping[str, int]
 ) -> dict[str, tuple[NDArray[np.float64], str, str]]:
     """Name -> values in SI, their unit, and the unit they were given in."""
-    from crashkit.readers._parameters import parameter_columns
+    from crashkit.readers.parameter_names import parameter_columns
 
     if not isinstance(given, Mapping):
         raise DataError(f"parameters: is {type(given).__name__}; expected a mapping of names to values, one a run")

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
-from crashkit.readers._checks import reading
+from crashkit.readers.checks import reading
 from data_schema import UnknownUnits, si_unit, unit_system
 
 if TYPE_CHECKING:

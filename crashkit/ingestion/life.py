@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.ingestion.structure import Structure
-from crashkit.readers._checks import reading
 from crashkit.readers.base import Run, RunMesh, split_states
+from crashkit.readers.checks import reading
 
 Flags = NDArray[np.bool_]
 Rows = NDArray[np.int64]

@@ -26,7 +26,7 @@ from typing import Any
 
 from crashkit.errors import DataError, ReadError
 from crashkit.extras import need
-from crashkit.readers._parameters import parameter_columns, parameter_name
+from crashkit.readers.parameter_names import parameter_columns, parameter_name
 from data_schema.units import is_unit
 
 # The column with the names of the runs, the first that is there; the others are names for people.

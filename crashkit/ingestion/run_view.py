@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from crashkit.errors import ReadError
 from crashkit.ingestion.structure import Structure
 from crashkit.ingestion.survey import Field, cell_fields
-from crashkit.readers._checks import reading
 from crashkit.readers.base import Run
+from crashkit.readers.checks import reading
 from data_schema.units import UnitSystem, UnknownUnits
 
 Flags = NDArray[np.bool_]

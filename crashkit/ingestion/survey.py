@@ -21,9 +21,9 @@ from crashkit.ingestion.life import Dead, lives_at_start, never_alive
 from crashkit.ingestion.parameter_table import ParameterTable, read_parameter_table
 from crashkit.ingestion.structure import Structure, matched, structure_of
 from crashkit.readers import passed_over, reader_for
-from crashkit.readers._checks import reading
-from crashkit.readers._parameters import parameter_columns
 from crashkit.readers.base import FieldInfo, Run, RunMesh, Runs
+from crashkit.readers.checks import reading
+from crashkit.readers.parameter_names import parameter_columns
 from data_schema import DIMENSIONS, VARIABLES, to_si, unit_system
 from data_schema.units import UnknownUnits, si_unit
 

@@ -13,9 +13,9 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from crashkit.errors import CrashkitError, ReadError
-from crashkit.readers._checks import LIBRARY_ERRORS, is_damaged_hdf5
 from crashkit.readers._foreign import name_of
 from crashkit.readers.base import Reader, Runs
+from crashkit.readers.checks import LIBRARY_ERRORS, is_damaged_hdf5
 
 ENTRY_POINT_GROUP = "crashkit.readers"
 _log = logging.getLogger(__name__)

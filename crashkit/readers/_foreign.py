@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 
-from crashkit.readers._checks import LIBRARY_ERRORS
 from crashkit.readers._folders import files_in
+from crashkit.readers.checks import LIBRARY_ERRORS
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 # Suffix -> what it is and what to do. Told by suffix alone, since the contents are secret.

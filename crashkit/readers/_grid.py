@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
-from crashkit.readers._checks import require_indices
 from crashkit.readers._names import NODE_IDS
+from crashkit.readers.checks import require_indices
 
 Place = Literal["point", "cell"]
 

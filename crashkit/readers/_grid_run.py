@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
 from crashkit.readers._cells import shell_faces
-from crashkit.readers._checks import holds_positions, reading, require_finite, time_problems
 from crashkit.readers._grid import Grid, GridSource, Place
 from crashkit.readers._names import (
     DISPLACEMENT_NAMES,
@@ -29,6 +28,7 @@ from crashkit.readers._names import (
     vectors_among,
 )
 from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh
+from crashkit.readers.checks import holds_positions, reading, require_finite, time_problems
 
 # VTK cell type -> (corners that are kept, in the order of the linear cell, its type). Middle nodes are left out.
 _FACES = {5: (0, 1, 2), 8: (0, 1, 3, 2), 9: (0, 1, 2, 3), 22: (0, 1, 2), 23: (0, 1, 2, 3), 28: (0, 1, 2, 3)}

@@ -33,11 +33,11 @@ from crashkit.errors import ReadError
 from crashkit.readers import register
 from crashkit.readers._binout import binout_files, read_binout
 from crashkit.readers._cells import LINE, VERTEX, shell_faces, solid_cells, stack_cells
-from crashkit.readers._checks import require_finite, require_indices, require_options, time_problems
 from crashkit.readers._d3plot_file import D3plotFile, word_size
 from crashkit.readers._folders import Collected, files_in, named, recognises, runs_in
 from crashkit.readers._names import DRAWN_WALL, WALL_NAME, quantity
 from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh, Runs
+from crashkit.readers.checks import require_finite, require_indices, require_options, time_problems
 from crashkit.readers.history import History
 
 _RIGID = 20

@@ -25,13 +25,13 @@ from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
 from crashkit.readers import register
-from crashkit.readers._checks import LIBRARY_ERRORS, reading, require_options
 from crashkit.readers._folders import Collected, files_in, named, recognises, runs_in
 from crashkit.readers._grid import Grid, GridSource, Place
 from crashkit.readers._grid_run import GridRun
 from crashkit.readers._hdf5_data import files_behind
 from crashkit.readers._names import vectors_among
 from crashkit.readers.base import Run, Runs
+from crashkit.readers.checks import LIBRARY_ERRORS, reading, require_options
 
 # Zeros behind a classic file up to this many are padding.
 _PADDING = 1 << 20

@@ -31,7 +31,10 @@ from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
 from crashkit.readers import register
-from crashkit.readers._checks import (
+from crashkit.readers._hdf5_data import files_behind
+from crashkit.readers._names import quantity
+from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh, Runs
+from crashkit.readers.checks import (
     LIBRARY_ERRORS,
     reading,
     require_finite,
@@ -40,11 +43,8 @@ from crashkit.readers._checks import (
     time_problems,
     time_step_option,
 )
-from crashkit.readers._hdf5_data import files_behind
-from crashkit.readers._names import quantity
-from crashkit.readers._parameters import parameter_columns
-from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh, Runs
 from crashkit.readers.history import Channel, History, quantity_of
+from crashkit.readers.parameter_names import parameter_columns
 from data_schema import UnknownUnits, si_unit, to_si
 from data_schema.units import quantity_in
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-
 # What curves measure, by the words in their names.
 _QUANTITIES = {
     "energy": "energy", "work": "energy", "momentum": "momentum", "force": "force", "moment": "moment",

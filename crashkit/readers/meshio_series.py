@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from crashkit.errors import CrashkitError, ReadError
 from crashkit.extras import need
 from crashkit.readers import register
-from crashkit.readers._checks import reading, require_options, time_step_option
 from crashkit.readers._folders import Collected, files_in, named, one_file_each, recognises
 from crashkit.readers._grid import Grid, WholeStates
 from crashkit.readers._grid_run import GridRun
 from crashkit.readers._hdf5_data import files_behind
 from crashkit.readers.base import Run, Runs
+from crashkit.readers.checks import reading, require_options, time_step_option
 
 _XDMF = re.compile(rb"<Xdmf[\s>]")
 _NUMBERED = re.compile(r"(?P<stem>.*?)[_.-]?(?P<number>\d+)")

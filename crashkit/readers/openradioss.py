@@ -26,12 +26,12 @@ from crashkit.errors import ReadError
 from crashkit.readers import _radioss_deck as deck
 from crashkit.readers import register
 from crashkit.readers._cells import LINE, VERTEX, shell_faces, solid_cells, stack_cells
-from crashkit.readers._checks import require_finite, require_indices, require_options, time_problems
 from crashkit.readers._folders import Collected, files_in, named, recognises, runs_in
 from crashkit.readers._names import DISPLACEMENT_NAMES, WALL_NAME, field_name, quantity
 from crashkit.readers._radioss_file import Array, Content, beginning, read_layout, starts_well
 from crashkit.readers._radioss_history import read_history
 from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh, Runs, distinct_parts
+from crashkit.readers.checks import require_finite, require_indices, require_options, time_problems
 from crashkit.readers.history import History
 
 _FILE = re.compile(r"(?P<root>.+)A(?P<number>\d{3,4})(?:\.gz)?")

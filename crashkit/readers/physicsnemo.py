@@ -27,12 +27,12 @@ from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
 from crashkit.readers import register
-from crashkit.readers._checks import holds_positions, reading, require_options, time_step_option
 from crashkit.readers._folders import Collected, one_file_each, recognises
 from crashkit.readers._grid import Grid, GridSource, Place
 from crashkit.readers._grid_run import GridRun
 from crashkit.readers._vtk_process import point_array_names, read_xml
 from crashkit.readers.base import Run, Runs
+from crashkit.readers.checks import holds_positions, reading, require_options, time_step_option
 
 _STATE = re.compile(r"(?P<name>.+)_t(?P<time>\d+(?:\.\d+)?)")
 _DISPLACEMENT = "displacement"

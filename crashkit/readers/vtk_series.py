@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
 from crashkit.readers import register
-from crashkit.readers._checks import reading, require_options, time_step_option
 from crashkit.readers._folders import Collected, files_in, named, recognises, runs_in
 from crashkit.readers._grid import Grid, WholeStates
 from crashkit.readers._grid_run import GridRun
@@ -35,6 +34,7 @@ from crashkit.readers._vtk_legacy import is_legacy, legacy_field_data, read_lega
 from crashkit.readers._vtk_lists import Leaf, kind_of, leaves, listed_states, named_files
 from crashkit.readers._vtk_process import read_xml
 from crashkit.readers.base import Run, Runs
+from crashkit.readers.checks import reading, require_options, time_step_option
 
 _NUMBERED = re.compile(r"(?P<stem>.*?)(?P<number>\d+)")
 _NUMBERED_SUFFIXES = (".vtu", ".vtp", ".vtk", ".pvtu", ".pvtp", ".vtm")

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
 from crashkit.readers import register
-from crashkit.readers._checks import LIBRARY_ERRORS, reading, require_options
 from crashkit.readers._folders import Collected, one_file_each, recognises
 from crashkit.readers._grid import Grid, GridSource, Place
 from crashkit.readers._grid_run import GridRun
 from crashkit.readers._hdf5_data import files_behind
 from crashkit.readers.base import Run, Runs
+from crashkit.readers.checks import LIBRARY_ERRORS, reading, require_options
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 _GRIDS = ("UnstructuredGrid", "PolyData")

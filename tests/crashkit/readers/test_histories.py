@@ -104,7 +104,15 @@ def test_a_wrong_byte_in_the_head_is_one_line_or_nothing(place: int, byte: int) 
 
 def test_a_group_record_that_is_too_short_is_one_line(tmp_path: Path) -> None:
     file = tmp_path / "shortT01"
-    records = [struct.pack(">i", 4021) + bytes(100), b"date", b"", b"", b"", struct.pack(">6i", 0, 0, 0, 0, 1, 0), b"1234"]
+    records = [
+        struct.pack(">i", 4021) + bytes(100),
+        b"date",
+        b"",
+        b"",
+        b"",
+        struct.pack(">6i", 0, 0, 0, 0, 1, 0),
+        b"1234",
+    ]
     file.write_bytes(b"".join(struct.pack(">i", len(r)) + r + struct.pack(">i", len(r)) for r in records))
     with pytest.raises(ReadError, match=r"shortT01: the record before byte .* is shorter than its kind"):
         read_history(file)
