@@ -156,8 +156,8 @@ class Run(ABC):
         return None
 
     def file_of(self, state: int) -> Path:
-        """The file that holds a state, for messages; the first one where a reader does not know better."""
-        return self.files[0]
+        """The file that holds a state, for messages. Without a reader's own answer: of as many files as states, that one."""
+        return self.files[state if len(self.files) == len(self.time) else 0]
 
     def close(self) -> None:  # noqa: B027 - most readers hold nothing open
         """Let go of files."""
