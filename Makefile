@@ -12,7 +12,7 @@ demo: $(READY)
 	$(BIN)/crashkit demo -o $(DEMO)
 
 test: $(READY) check
-	$(BIN)/python -m pytest -n 2 --dist loadgroup
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 # What takes more than 40 s a test.
 nightly: $(READY)

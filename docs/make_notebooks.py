@@ -14,6 +14,7 @@ from nbclient import NotebookClient
 
 FOLDER = Path(__file__).resolve().parent / "notebooks"
 ORDER = ("runs_to_report", "arrays_to_surrogate", "report_numbers")
+NEEDS = {"report_numbers": "runs_to_report"}
 
 
 def execute(name: str, folder: Path) -> nbformat.NotebookNode:

@@ -17,7 +17,6 @@ from crashkit.dataset import demo_data
 DOCS = Path(__file__).parents[2] / "docs"
 SCRIPTS = Path(__file__).parents[2] / "examples" / "gallery"
 gallery = runpy.run_path(str(DOCS / "make_gallery.py"))
-pytestmark = pytest.mark.xdist_group("gallery")
 
 
 @pytest.fixture(scope="session")
