@@ -14,6 +14,9 @@ import tempfile
 import pytest
 from hypothesis import settings
 
+# Two workers and their child processes share two cores: with more threads each, they would wait for one another.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 # A shell starts what runs in the background deaf to Ctrl-C, and children inherit that; tests that interrupt need ears.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
