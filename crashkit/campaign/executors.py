@@ -10,7 +10,7 @@ import os
 import signal
 import subprocess
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 from crashkit.campaign import job
 from crashkit.campaign.box import CampaignError
@@ -111,7 +111,7 @@ class Slurm:
 
 
 class Dask:
-    """Workers of a Dask scheduler that see the same files."""
+    """Workers of a Dask scheduler that see the same files; `with Dask(address) as executor` lets the scheduler go again."""
 
     def __init__(self, scheduler: str) -> None:
         try:
@@ -119,7 +119,8 @@ class Dask:
         except ImportError as error:
             raise CampaignError("a Dask scheduler needs dask; pip install 'crashkit[distributed]'") from error
         try:
-            self._client = Client(scheduler, timeout=5)
+            # Not everybody's default: what else runs in this process has nothing to ask of that scheduler.
+            self._client = Client(scheduler, timeout=5, set_as_default=False)
         except OSError as error:
             raise CampaignError(f"{scheduler}: no Dask scheduler answers there ({error})") from error
         self._futures: dict[str, Any] = {}
@@ -137,6 +138,16 @@ class Dask:
         future = self._futures.get(str(handle.get("key", "")))
         if future is not None:
             future.cancel()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the connection; jobs that run go on until the scheduler notices that nobody waits for them."""
+        self._client.close()
 
 
 def _call(command: list[str]) -> int:

@@ -48,7 +48,11 @@ def test_jobs_go_through_submitit(study: Path) -> None:
 
 
 def test_jobs_go_to_the_workers_of_a_dask_scheduler(study: Path, scheduler: str) -> None:
-    assert computed(study, Dask(scheduler)) == {"done"}
+    distributed = pytest.importorskip("distributed")
+    with Dask(scheduler) as executor:
+        assert computed(study, executor) == {"done"}
+        with pytest.raises(ValueError, match="No global client"):
+            distributed.default_client()
 
 
 def test_a_scheduler_that_does_not_answer_is_named() -> None:
