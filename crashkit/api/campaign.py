@@ -35,10 +35,13 @@ class RunField:
         return values
 
 
-def open_campaign(source: Source, test: WhichRuns | None = None, *, symmetry: bool = False) -> Campaign:
+def open_campaign(
+    source: Source, test: WhichRuns | None = None, *, symmetry: bool = False, odd: Sequence[str] = ()
+) -> Campaign:
     """The runs of a dataset without the test runs, as `crashkit.selection.runs_of` understands `test`.
 
-    symmetry  look for mirror planes of the mesh, where a parameter could say on which side something happens
+    symmetry  look for mirror planes of the mesh, where a parameter could say on which side something happens: one with
+              values on both sides of zero, or one of those declared `odd`
 
     The full field is read run by run by those models that need it; the cascade reads its levels only.
 
@@ -103,7 +106,7 @@ def open_campaign(source: Source, test: WhichRuns | None = None, *, symmetry: bo
         labels=labels_of(dataset),
         table_units=tuple(table_unit(dataset, n) for n in names),
         dimensions=tuple(dimension(str(dataset[n].attrs.get("units", ""))) for n in names),
-        mirrors=_mirrors(dataset) if symmetry and two_sided else (),
+        mirrors=_mirrors(dataset) if symmetry and (two_sided or odd) else (),
     )
 
 

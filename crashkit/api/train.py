@@ -125,7 +125,8 @@ def train(
     elif resume:
         raise SurrogateError("resume goes on with a training beside its model folder; give output")
     symmetry = chosen.model in ("mh", "podnn", "pod-gpr", "pod-rbf") and chosen.physics.symmetry == "auto"
-    campaign = open_campaign(source_of(dataset, hierarchy), test, symmetry=symmetry)
+    odd = chosen.physics.odd or ()
+    campaign = open_campaign(source_of(dataset, hierarchy), test, symmetry=symmetry, odd=odd)
     state = None if folder is None else folder.with_name(f".{folder.name}.training")
     with (
         tempfile.TemporaryDirectory(prefix="crashkit-") as scratch,

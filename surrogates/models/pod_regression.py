@@ -22,7 +22,7 @@ from surrogates.data.campaign import Campaign
 from surrogates.data.inputs import over_range
 from surrogates.data.samples import Notes, scale_of
 from surrogates.errors import SurrogateError
-from surrogates.physics.choice import Worth, choose
+from surrogates.physics.choice import Worth, choose, not_used
 from surrogates.physics.registration import Registration
 from surrogates.physics.trials import Courses, Folds, Machine, Trials, courses_of
 from surrogates.regression.gaussian import Gaussian, RadialBasis
@@ -191,6 +191,8 @@ def fit_pod_regression(
     folds = _folds(campaign, settings, chosen)
     trials = Trials(courses, campaign.parameters[chosen], folds, settings.model, settings.seed)
     registration, plane, worth = choose(campaign, chosen, settings, trials)
+    for line in not_used(registration, settings):
+        notes.add(line)
     candidates = [_Candidate("trajectory", registration, plane)]
     if settings.pod.inputs == "point":
         candidates = [_Candidate("point", Registration.identity(campaign.parameter_names, courses.time), 0)]

@@ -132,13 +132,12 @@ class _Search:
 
     def starts(self) -> list[_Way]:
         """Everything at once, for each parity that parameters may have, and without images."""
-        inputs = self.sets(())[0] if self.settings.inputs.derived != "off" else self.plain
         out = []
         clocks = [_sorted(k, {k: 0.25, **dict.fromkeys(self._strengths, 0.25)}) for k in self.speeds]
         for exponents in clocks or [()]:
-            out.append(_Way(inputs, exponents))
+            out.append(_Way(self.sets(())[0], exponents))
             for plane, odd in self.parities():
-                out.append(_Way(inputs, exponents, plane, odd, flagged=True))
+                out.append(_Way(self.sets(odd)[0], exponents, plane, odd, flagged=True))
         return out
 
     @property
@@ -158,7 +157,7 @@ class _Search:
         wish = self.settings.inputs.derived
         if wish == "off":
             return [self.plain]
-        logs = [logarithms(self.names, self.parameters, warp=warp) for warp in (True, False)]
+        logs = [logarithms(self.names, self.parameters, warp=warp, odd=odd) for warp in (True, False)]
         if not isinstance(wish, str):
             logs = [self._with_named(inputs, wish) for inputs in logs]
         out = [*logs, *(with_matrix(inputs, odd) for inputs in logs), self.plain]
@@ -272,6 +271,22 @@ def _worth(search: _Search, identity: _Way, way: _Way) -> dict[str, float]:
     return out
 
 
+def not_used(registration: Registration, settings: Settings) -> list[str]:
+    """A sentence for each wish of the settings that cross-validation, or the mesh, did not confirm."""
+    wish, out = settings.inputs.derived, []
+    if not isinstance(wish, str):
+        names = registration.inputs.names
+        taken = {column.powers for column in registration.inputs.columns if column.logarithm}
+        left = [text for text in wish if parse_monomial(text, names) not in taken]
+        out += [f"inputs.derived={text} did not lower the error in cross-validation and is not used" for text in left]
+    if settings.physics.odd and registration.symmetry.is_identity:
+        out.append(
+            f"physics.odd={', '.join(settings.physics.odd)} is not used: the mesh has no mirror plane, or mirrored runs "
+            "did not lower the error in cross-validation"
+        )
+    return out
+
+
 def _check_odd(settings: Settings, names: Sequence[str]) -> None:
     for name in settings.physics.odd or ():
         if name not in names:
@@ -297,4 +312,6 @@ def of_campaign(
     folds = Folds.of(len(everyone), settings.validation.folds, settings.seed)
     trials = Trials(courses, campaign.parameters, folds, "pod-gpr", settings.seed)
     registration, _, worth = choose(campaign, everyone, settings, trials)
+    for line in not_used(registration, settings):
+        notes.add(line)
     return registration, worth

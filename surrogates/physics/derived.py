@@ -142,20 +142,24 @@ class DerivedInputs:
         return cls(tuple(values["names"]), columns, tuple(int(k) for k in values["mixed"]))
 
 
-def logarithms(names: Sequence[str], parameters: NDArray[np.float64], *, warp: bool) -> DerivedInputs:
+def logarithms(
+    names: Sequence[str], parameters: NDArray[np.float64], *, warp: bool, odd: Sequence[str] = ()
+) -> DerivedInputs:
     """Logarithms of the parameters that are positive and spread; those that change sign warped, if asked.
 
     Parameters
     ----------
     parameters
         (run, parameter).
+    odd
+        Parameters that change their sign in mirrored runs, whatever sign they have here.
     """
     columns = []
     for k, row in enumerate(_unit_rows(len(names))):
         value = parameters[:, k]
-        if is_positive(value):
+        if is_positive(value) and names[k] not in odd:
             columns.append(Column(row, logarithm=True))
-        elif warp and value.min() < 0 < value.max():
+        elif warp and (names[k] in odd or value.min() < 0 < value.max()) and value.any():
             columns.append(Column(row, width=float(f"{WARP * np.abs(value).max():.3g}")))
         else:
             columns.append(Column(row))

@@ -202,7 +202,7 @@ def _most_likely(
     low, high = -_LENGTHS[1], -_LENGTHS[0]
     bounds = [*_BOUNDS, *[(low, high)] * p, *[(-_FURTHEST, _FURTHEST)] * len(beside)]
     first = np.concatenate([_START, np.full(p, -_LENGTH), np.full(len(beside), _BESIDE)])
-    if start is not None:
+    if start is not None and len(start.mix) == p:  # a parameter that one run alone changes is constant without it
         entries = [start.mix[i, j] for i, j in beside]
         first = np.concatenate([np.log(np.maximum(start.numbers, 1e-12)), np.log(np.diag(start.mix)), entries])
         first = np.clip(first, [b[0] for b in bounds], [b[1] for b in bounds])

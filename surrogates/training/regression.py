@@ -61,6 +61,12 @@ class Latents:
         return int(self.part.max()) + 1
 
     @property
+    def differ(self) -> bool:
+        """Whether the runs differ in any parameter, without which a process has nothing to go by."""
+        parameters = self.inputs[:, 0, : self.time_column]
+        return bool((parameters != parameters[:1]).any())
+
+    @property
     def time(self) -> Tensor:
         """(state,) scaled."""
         return self.inputs[0, :, self.time_column]
@@ -188,7 +194,7 @@ def choose_regression(
     """
     regressor = level.regressor
     course = course_of(latents, residual=regressor.residual, at_rest=level.at_rest).to(latents.values.device)
-    shares = SHARES[wish]
+    shares = SHARES[wish] if latents.differ else (0.0,)
     notes: list[str] = []
     networks: Tensor | None = None
     fitted = Fit()
@@ -197,7 +203,7 @@ def choose_regression(
         try:
             fitted = train(objective)
         except Diverged as error:
-            if wish != "auto":
+            if wish != "auto" or not latents.differ:
                 error.fit = None  # the level has no regression yet
                 raise
             fitted, shares = error.fit or Fit(status="diverged"), (1.0,)
@@ -207,8 +213,6 @@ def choose_regression(
             networks = torch.stack([objective.said(fold, everyone) for fold in range(latents.folds + 1)])
             regressor.take(objective.regressor, latents.folds * regressor.members)
     processes, process = _processes(latents, shares, seed, mixed)
-    if processes is None:
-        shares = (0.0,)
     said, errors = {}, {}
     for share in shares:
         said[share] = _mixed(networks, processes, share)
@@ -244,11 +248,9 @@ def _processes(
     latents: Latents, shares: Sequence[float], seed: int, mixed: Sequence[int]
 ) -> tuple[Tensor | None, LatentProcess | None]:
     """What processes without each fold, and of all runs, say (fold + 1, run, state, latent); and the one of all runs."""
-    if shares == (0.0,):
+    if shares == (0.0,) or not latents.differ:
         return None, None
     parameters = latents.inputs[:, 0, : latents.time_column].double().cpu().numpy()
-    if not np.ptp(parameters, axis=0).any():
-        return None, None
     time, sizes = latents.time.double().cpu().numpy(), latents.sizes.double().cpu().numpy()
     values, part = latents.values.double().cpu().numpy(), latents.part.cpu().numpy()
     out = torch.empty(latents.folds + 1, *values.shape, device=latents.values.device)

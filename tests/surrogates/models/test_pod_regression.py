@@ -90,6 +90,19 @@ def test_one_training_run_is_repeated_whatever_is_asked() -> None:
     assert any("one training run" in note for note in surrogate.record.notes)
 
 
+def test_a_parameter_that_one_run_alone_changes_is_constant_in_the_fold_without_it() -> None:
+    mu = plate.parameters(8)
+    mu[:, 2] = 3e8
+    mu[4, 2] = 4e8
+    u = plate.displacement(mu)
+    off = ["inputs.derived=off", "physics.clock=off", "pod.modes=[4]", "pod.inputs=trajectory"]
+    surrogate = train_surrogate(
+        plate.campaign(8, parameters=mu, displacement=lambda level: u), settings("pod-gpr", overrides=off)
+    )
+    assert len(surrogate.record.left_out) == 8
+    assert np.isfinite(surrogate.predict(mu[4])).all()
+
+
 def still(runs: int) -> Campaign:
     return plate.campaign(runs, displacement=lambda level: np.zeros((runs, 7, 81, 3), np.float32))
 

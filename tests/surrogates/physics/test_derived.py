@@ -77,6 +77,12 @@ def test_units_allow_damage_numbers_and_ratios_of_one_kind_alone() -> None:
     assert not candidates(NAMES, (None,) * 5, RUNS)
 
 
+def test_what_is_odd_is_warped_and_not_in_a_logarithm_whatever_its_sign() -> None:
+    assert logarithms(NAMES, RUNS, warp=True, odd=["box"]).told()[3] == f"asinh(box / {RUNS[:, 3].max() / 3:.3g})"
+    assert logarithms(NAMES, RUNS, warp=False, odd=["box"]).told()[3] == "box"
+    assert logarithms(NAMES, RUNS, warp=True).told()[3] == "ln(box)"
+
+
 def test_inputs_can_be_undone_and_stored() -> None:
     inputs = with_monomial(logarithms(NAMES, RUNS, warp=True), parse_monomial("speed**2/(strength*box**2)", NAMES), 4)
     inputs = with_matrix(inputs, ["offset"])
