@@ -105,14 +105,16 @@ class Chosen:
 class FoldedNetworks(Objective):
     """Networks for each fold and for all runs, trained side by side; validation is on what each fold left out."""
 
-    def __init__(self, regressor: Regressor, course: Course, latents: Latents, scale: float) -> None:
+    def __init__(self, regressor: Regressor, courses: Sequence[Course], latents: Latents, scale: float) -> None:
+        """`courses`: of the runs without each fold, and of all."""
         super().__init__()
         self.latents, self.unit = latents, scale
         self.members, self.residual = regressor.members, regressor.residual
         self.regressor: Team = regressor.team(self.members * (latents.folds + 1)).to(latents.values.device)
         if self.residual:
             self.regressor.end_at_zero()
-        self.mean, self.growth = course(latents.time)
+        told = [course(latents.time) for course in courses]
+        self.mean, self.growth = (torch.stack(some) for some in zip(*told, strict=True))
         places = latents.known.nonzero()
         self.run, self.state = places[:, 0], places[:, 1]
         self.size = len(places)
@@ -162,17 +164,22 @@ class FoldedNetworks(Objective):
         if below is not None:
             coarse = below[folds][:, run, state].repeat_interleave(self.members, dim=0)
             x = torch.cat([x.expand(len(coarse), -1, -1), coarse], dim=2)
-        out = torch.addcmul(self.mean[state], self.growth[state], self.regressor(x, some))
+        mean, growth = (t[folds][:, state].repeat_interleave(self.members, dim=0) for t in (self.mean, self.growth))
+        out = torch.addcmul(mean, growth, self.regressor(x, some))
         if below is None or not self.residual:
             return out
         return out + nn.functional.pad(coarse, (0, out.shape[2] - coarse.shape[2]))
 
 
-def course_of(latents: Latents, *, residual: bool, at_rest: bool) -> Course:
-    """The mean course of the training runs, or of what they add to the coarse level's; growth 1 unless `at_rest`."""
-    values = latents.values
+def course_of(latents: Latents, fold: int, *, residual: bool, at_rest: bool) -> Course:
+    """The mean course of the runs that `fold` does not leave out (those of all for the fold behind the last).
+
+    With `residual` it is that of what they add to the coarse level's; growth is 1 unless `at_rest`.
+    """
+    trains = latents.part != fold
+    values = latents.values[trains]
     if residual and latents.below is not None:
-        coarse = latents.below[-1]
+        coarse = latents.below[fold][trains]
         values = values - nn.functional.pad(coarse, (0, values.shape[2] - coarse.shape[2]))
     mean = values.mean(dim=0)
     spread = ((values - mean).square() @ latents.sizes.square()).mean(dim=0).sqrt()
@@ -193,13 +200,16 @@ def choose_regression(
     mixed  parameters whose lengths form a full matrix, see `regression.gaussian.Gaussian`
     """
     regressor = level.regressor
-    course = course_of(latents, residual=regressor.residual, at_rest=level.at_rest).to(latents.values.device)
+    courses = [
+        course_of(latents, fold, residual=regressor.residual, at_rest=level.at_rest).to(latents.values.device)
+        for fold in range(latents.folds + 1)
+    ]
     shares = SHARES[wish] if latents.differ else (0.0,)
     notes: list[str] = []
     networks: Tensor | None = None
     fitted = Fit()
     if shares != (1.0,):
-        objective = FoldedNetworks(regressor, course, latents, level.scale)
+        objective = FoldedNetworks(regressor, courses, latents, level.scale)
         try:
             fitted = train(objective)
         except Diverged as error:
@@ -218,7 +228,7 @@ def choose_regression(
         said[share] = _mixed(networks, processes, share)
         errors[share] = level.scale * _error(Chosen(said[share], share, fitted).left_out(latents), latents)
     best = min(errors, key=lambda share: errors[share])
-    level.course = course if best < 1 else None
+    level.course = courses[-1] if best < 1 else None
     level.process = process if best > 0 else None
     if level.process is not None:
         level.process.share.fill_(best)
