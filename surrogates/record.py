@@ -49,12 +49,13 @@ class Record:
     ranges      names, units and ranges of the parameters, and of the time, over the runs it was fitted to
     time        (state,) s, the states it was trained on
     fits        how each level's training went
-    errors      e2 (m) by what was measured, on validation runs, on the level's own nodes
-    choice      what a POD regression chose by cross-validation: inputs and modes
+    errors      e2 (m) by what was measured, on validation runs or on the runs that folds left out, on the level's own
+                nodes unless it says lifted; "reduction alone" is that of the reduction kept
+    choice      what was chosen by cross-validation: inputs and modes of a POD regression, or by level, in words
     physics     inputs, clock and symmetry in words, and "errors": e2 (m) by what each was worth in cross-validation
     parameters  parameter -> its values in the runs it was fitted to, for marks on sliders
-    left_out    run -> e2 (m) when it is left out of the training, and the deviation the process then believes in, up to
-                a factor; of processes alone
+    left_out    run -> e2 (m) when it is left out of the training, of the finest level; and the deviation the process
+                then believes in, up to a factor (1 for a cascade). Empty where validation runs judged
     notes       what was unusual about the data
     """
 

@@ -16,7 +16,7 @@ def card(surrogate: Surrogate) -> str:
     record, settings = surrogate.record, surrogate.settings
     ranges = record.ranges
     names = " -> ".join(surrogate.level_names)
-    by_folds = settings.model in ("pod-gpr", "pod-rbf")
+    by_folds = bool(record.left_out)
     lines = [
         f"# {names}",
         "",
@@ -50,14 +50,15 @@ def card(surrogate: Surrogate) -> str:
     if record.errors and by_folds:
         lines += [
             "Mean distance between true and predicted nodes over nodes, states and training runs, each run predicted by a model",
-            "that was fitted without it. The number of modes was chosen by these errors, so test runs may be a little worse.",
+            "that was fitted without it; what the reduction of a network alone loses is that of the one fitted to all runs.",
+            "Choices were made by these errors, so test runs may be a little worse.",
             "",
             *_table(("measured", "error (cm)"), [(k, f"{100 * v:.3f}") for k, v in record.errors.items()]),
         ]
     elif record.errors:
         lines += [
             "Mean distance between true and predicted nodes over nodes, states and validation runs, on each level's own",
-            "nodes unless lifted. Validation runs chose the weights kept (or the number of modes), so test runs may be worse.",
+            "nodes unless lifted. Validation runs chose the weights kept, so test runs may be worse.",
             "",
             *_table(("measured", "error (cm)"), [(k, f"{100 * v:.3f}") for k, v in record.errors.items()]),
         ]

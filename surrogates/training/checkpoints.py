@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
@@ -44,7 +45,10 @@ class Checkpoints:
         self.folder, self.every = folder, every
         self._last = time.monotonic()
         self._writes = _rank() == 0
-        identity = {"settings": settings.as_dict(), "data": campaign.checksum, "runs": list(campaign.runs)}
+        identity = {
+            "settings": settings.as_dict(), "data": campaign.checksum, "runs": list(campaign.runs),
+            "mesh hierarchy": _digest(campaign),
+        }  # fmt: skip
         self.fingerprint = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]
         if resume:
             self._check(identity)
@@ -99,6 +103,12 @@ class Checkpoints:
                 raise SurrogateError(
                     f"{self.folder}: belongs to a training with other {key}; train without resuming, or with the same {key}"
                 )
+
+
+def _digest(campaign: Campaign) -> str:
+    """What tells hierarchies apart that have the same numbers of nodes; the dataset's checksum does not cover them."""
+    nodes = [np.asarray(level.kept, np.int64).tobytes() for level in campaign.levels]
+    return hashlib.sha256(b"".join(nodes)).hexdigest()[:16]
 
 
 def _rank() -> int:

@@ -11,6 +11,7 @@ import pytest
 
 from surrogates.errors import ModelFolderError
 from surrogates.settings import settings
+from surrogates.storage.card import card
 from surrogates.storage.folder import load, save
 from surrogates.surrogate import Surrogate
 from surrogates.training.train import train_surrogate
@@ -52,9 +53,21 @@ def test_history_ranges_and_card_come_back(folder: Path, surrogate: Surrogate) -
     np.testing.assert_array_equal(again.history(1)["total"], surrogate.history(1)["total"])
     assert again.training_seconds(1) == surrogate.training_seconds(1)
     assert again.record.ranges.names == surrogate.record.ranges.names
-    card = (folder / "card.md").read_text()
-    assert "| MH1 | 1 | 25 |" in card
-    assert "2 runs kept away: run_900, run_901" in card
+    text = (folder / "card.md").read_text()
+    assert "| MH1 | 1 | 25 |" in text
+    assert "2 runs kept away: run_900, run_901" in text
+
+
+def test_the_card_says_which_runs_its_errors_are_of(folder: Path) -> None:
+    by_folds = (folder / "card.md").read_text()
+    assert "## Errors in cross-validation" in by_folds
+    assert "Chosen by cross-validation: MH2 " in by_folds
+    assert "validation runs chose" not in by_folds.lower()
+    held = train_surrogate(
+        plate.campaign(8), settings("mh", overrides=["level.epochs=1", "level.regression=network", "levels=[2]"])
+    )
+    assert "## Errors on validation runs" in card(held)
+    assert "Validation runs chose the weights kept" in card(held)
 
 
 def test_nothing_in_the_folder_is_a_pickle(folder: Path) -> None:
@@ -132,8 +145,6 @@ def test_a_save_that_fails_leaves_nothing_behind(
 
 def test_names_of_strangers_break_no_table_of_the_card(surrogate: Surrogate) -> None:
     from dataclasses import replace
-
-    from surrogates.storage.card import card
 
     record = surrogate.record
     before = record.fitted_runs, record.ranges

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -130,6 +131,15 @@ def test_resuming_another_training_is_refused(tmp_path: Path) -> None:
     Checkpoints(tmp_path / "state", settings("mh"), campaign)
     with pytest.raises(SurrogateError, match="belongs to a training with other settings"):
         Checkpoints(tmp_path / "state", settings("mh", overrides=["seed=9"]), campaign, resume=True)
+
+
+def test_resuming_on_another_hierarchy_of_the_same_size_is_refused(tmp_path: Path) -> None:
+    campaign = plate.campaign(4)
+    Checkpoints(tmp_path / "state", settings("mh"), campaign)
+    fine, coarse = campaign.levels
+    other = replace(campaign, levels=(fine, replace(coarse, kept=coarse.kept[::-1])))
+    with pytest.raises(SurrogateError, match="belongs to a training with other mesh hierarchy"):
+        Checkpoints(tmp_path / "state", settings("mh"), other, resume=True)
 
 
 def test_resuming_without_anything_is_refused(tmp_path: Path) -> None:
