@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from crashkit.api._design import Known
 from crashkit.api.campaign import open_campaign
+from crashkit.api.source import source_of
 from crashkit.campaign.box import Box
 from crashkit.selection import runs_of
 from surrogates.data.campaign import Campaign
@@ -49,7 +50,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
 
-    whole = open_campaign(args.dataset, symmetry=True)
+    whole = open_campaign(source_of(args.dataset), symmetry=True)
     memory = np.stack([np.asarray(whole.displacement(0)[k]) for k in range(len(whole.parameters))])
     memory = np.ascontiguousarray(memory[:, :: args.every])
     whole = replace(whole, displacement=lambda level: memory, time=whole.time[:: args.every])

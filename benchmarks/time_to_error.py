@@ -105,7 +105,7 @@ def compare(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, default=None, help="coarsened dataset; default: the embedded runs")
-    parser.add_argument("--test", default=DEMO_TEST, help="runs that nobody may see")
+    parser.add_argument("--test", default=DEMO_TEST, help="runs held out for testing")
     parser.add_argument("--work", type=Path, default=None, help="where trained models stay; default: nowhere")
     parser.add_argument("--levels", type=int, nargs="+", default=None, help="default: all")
     parser.add_argument("--epochs", type=int, default=None, help="of the baseline; default 1500")

@@ -18,7 +18,7 @@ between layers, and nothing else moves.
 
 The graphs: a triangulated band, or with `--mesh` the surface in a file and its coarse levels.
 Turns: one step of each in turn until the time is spent; the median of each is given, so a busy machine slows both.
-`--forms` compares instead the sparse and the dense form of the operator, which settles `operators.DENSE_UP_TO`.
+`--forms` compares instead the sparse and the dense form of the operator, which settles `surrogates.operators.graph.DENSE_UP_TO`.
 `--quick` leaves out 9314 nodes and takes 3 seconds for each size; `--json` writes the ratios.
 """
 
@@ -227,11 +227,7 @@ def compare_forms(n_nodes: int, seconds: float) -> dict[str, float]:
     """The fused convolution over the sparse operator against the same over the dense one."""
     edges = band(n_nodes)
     x, inputs = torch.randn(3, n_nodes, BATCH).permute(1, 2, 0), torch.randn(BATCH, 4)
-    steps = []
-    for limit in (0, n_nodes):
-        model = Ours(edges, n_nodes)
-        steps.append(stepper(model, x, inputs, fused=True))
-        model.encoder.convolutions.operator.dense_up_to = limit
+    steps = [stepper(Ours(edges, n_nodes, form), x, inputs, fused=True) for form in ("sparse", "dense")]
     sparse, dense = median_turns(steps, seconds)
     return {"nodes": n_nodes, "sparse_ms": 1e3 * sparse, "dense_ms": 1e3 * dense}
 

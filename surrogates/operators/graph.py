@@ -22,8 +22,8 @@ from surrogates.errors import SurrogateError
 ConvolutionKind = Literal["cheb", "gcn", "gcn2"]
 Form = Literal["auto", "sparse", "dense"]
 
-# Up to this many nodes one small dense product beats the sparse one; measured with `benchmarks/train_step.py --forms`.
-DENSE_UP_TO = {"cpu": 32, "cuda": 512, "mps": 4096}
+# Up to this many nodes one dense product beats the sparse one: on a CPU at no size (`benchmarks/train_step.py --forms`).
+DENSE_UP_TO = {"cpu": 0, "cuda": 512, "mps": 4096}
 # Up to this many nodes all channels move in one sparse product.
 WIDE_UP_TO = 2048
 
