@@ -7,7 +7,7 @@ the barycentric weights of the closest point of the mesh there, as in `crashkit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -92,7 +92,7 @@ def mirror_planes(position: ArrayLike, face_nodes: ArrayLike, face_part: ArrayLi
     MeshError
         As `surface` does.
     """
-    mesh = surface(position, face_nodes, face_part)
+    mesh, moved = _surface(position, face_nodes, face_part)
     edge = float(np.linalg.norm(np.diff(mesh.position[mesh.edges], axis=1)[:, 0], axis=1).mean())
     found: list[MirrorPlane] = []
     for normal, offset in _candidates(mesh):
@@ -102,7 +102,7 @@ def mirror_planes(position: ArrayLike, face_nodes: ArrayLike, face_part: ArrayLi
         plane = _plane(mesh, normal, offset, edge)
         fits = plane.mean <= MEAN_WITHIN * edge and plane.most <= MOST_WITHIN * edge
         if fits and not any(abs(plane.normal @ other.normal) > _ALIKE for other in found):
-            found.append(plane)
+            found.append(replace(plane, offset=plane.offset + float(plane.normal @ moved)))
     return sorted(found, key=lambda plane: plane.mean)
 
 
@@ -116,11 +116,20 @@ def mirror_plane(
     MeshError
         As `surface` does.
     """
-    mesh = surface(position, face_nodes, face_part)
+    mesh, moved = _surface(position, face_nodes, face_part)
     edge = float(np.linalg.norm(np.diff(mesh.position[mesh.edges], axis=1)[:, 0], axis=1).mean())
     direction = np.asarray(normal, np.float64)
     length = float(np.linalg.norm(direction))
-    return _plane(mesh, direction / length, float(offset) / length, edge)
+    unit, place = direction / length, float(offset) / length
+    return replace(_plane(mesh, unit, place - float(unit @ moved), edge), offset=place)
+
+
+def _surface(
+    position: ArrayLike, face_nodes: ArrayLike, face_part: ArrayLike | None
+) -> tuple[Surface, NDArray[np.float64]]:
+    """The surface, and by what (3,) it was moved towards the origin, as `surface` does with a mesh far away from it."""
+    mesh = surface(position, face_nodes, face_part)
+    return mesh, np.asarray(position, np.float64)[0] - mesh.position[0]
 
 
 def reflection(normal: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -167,7 +176,7 @@ def _settled(
             values, vectors = np.linalg.eigh(across.T @ across)
             if values[-1] <= 0:
                 break
-            normal = vectors[:, -1] * np.sign(vectors[:, -1] @ normal)
+            normal = vectors[:, -1] if vectors[:, -1] @ normal >= 0 else -vectors[:, -1]
         offset = float(((one + other) / 2 @ normal).mean())
     return normal, offset
 

@@ -80,3 +80,20 @@ def test_a_named_plane_is_taken_however_badly_it_fits() -> None:
     np.testing.assert_allclose(plane.normal, [1, 0, 0])
     assert plane.offset == pytest.approx(0.5)
     np.testing.assert_allclose(plane.reflection, np.diag([-1.0, 1.0, 1.0]))
+
+
+def test_the_plane_of_a_mesh_far_from_the_origin_is_where_the_mesh_is() -> None:
+    points, quads, part = box()
+    near, far = mirror_planes(points, quads, part)[0], mirror_planes(points + np.array([0, 700.0, 0]), quads, part)[0]
+    assert far.offset == pytest.approx(near.offset + 700.0 * near.normal[1], abs=1e-9)
+    assert far.name == "y = 700 m"
+    assert far.mean == pytest.approx(near.mean, abs=1e-9)
+    named = mirror_plane(points + np.array([0, 700.0, 0]), quads, [0.0, 1.0, 0.0], 700.0)
+    assert (named.offset, named.mean) == (700.0, pytest.approx(near.mean, abs=1e-9))
+
+
+def test_every_plane_has_a_normal_of_length_one() -> None:
+    points, quads, part = box()
+    for shift in (0.0, 700.0):
+        for plane in mirror_planes(points + np.array([0, shift, 0]), quads, part):
+            assert np.linalg.norm(plane.normal) == pytest.approx(1)
