@@ -9,7 +9,7 @@ import contextlib
 import importlib.util
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import xarray as xr
@@ -21,9 +21,6 @@ from crashkit.netcdf import open_netcdf
 from data_schema import VARIABLES
 from data_schema import dataset_checksum as _checksum_from
 from data_schema.checksum import digests_of_run, run_checksum
-
-if TYPE_CHECKING:
-    pass
 
 
 def open_dataset(path: str | Path, *, chunks: Literal["stored"] | Mapping[str, int] | None = "stored") -> xr.Dataset:

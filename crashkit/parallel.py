@@ -113,6 +113,8 @@ def _client(workers: int, scheduler: str | None, patience: float) -> Iterator[An
         try:
             client = stack.enter_context(Client(address, timeout=patience))
         except (OSError, ValueError) as error:
+            if scheduler is None:
+                raise CrashkitError(f"the processes on this machine do not answer ({error}); use one worker") from error
             raise CrashkitError(
                 f"{scheduler}: no Dask scheduler answers there ({error}); start one with `dask scheduler`, or take workers of "
                 "this machine"

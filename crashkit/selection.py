@@ -4,15 +4,10 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from crashkit.errors import DataError
-
-if TYPE_CHECKING:
-    pass
-
 
 WhichRuns = int | float | slice | str | Sequence[int | str]
 

@@ -59,6 +59,7 @@ def explore(
 
     from crashkit.api.predict import load_model
     from crashkit.errors import DataError, OutputError
+    from data_schema.replace import beside
     from evaluation.explorer.page import BrowserModel, ExplorerMesh, explorer_page
     from surrogates.storage.browser import browsable
 
@@ -94,10 +95,8 @@ def explore(
         largest=largest, axis=_axis(first), share=share,
     )  # fmt: skip
     try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        beside = output.with_name(output.name + ".partial")
-        beside.write_text(page, encoding="utf-8")
-        beside.replace(output)
+        with beside(output) as new:
+            new.write_text(page, encoding="utf-8")
     except OSError as error:
         raise OutputError(
             f"{output}: cannot be written ({error.strerror or error}); choose another place with -o"

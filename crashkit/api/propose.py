@@ -88,12 +88,12 @@ def _parameters(dataset: str | Path) -> tuple[list[str], list[str], NDArray[np.f
     from crashkit.dataset import open_dataset
     from data_schema import parameters
 
-    opened = open_dataset(dataset, chunks=None)
-    names = parameters(opened)
-    if not names:
-        raise CampaignError("the runs have no parameters; give them with crashkit ingest --params")
-    values = np.stack([opened[n].values.astype(np.float64) for n in names], axis=1)
-    return names, [str(opened[n].attrs.get("units", "")) for n in names], values
+    with open_dataset(dataset, chunks=None) as opened:
+        names = parameters(opened)
+        if not names:
+            raise CampaignError(f"{dataset}: no run has a parameter; give them with crashkit ingest --params")
+        values = np.stack([opened[n].values.astype(np.float64) for n in names], axis=1)
+        return names, [str(opened[n].attrs.get("units", "")) for n in names], values
 
 
 def _most_useful(

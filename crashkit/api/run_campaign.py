@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -96,6 +97,12 @@ def run_campaign(
     from crashkit.extras import need
 
     need("running a campaign", "campaign")
+    if os.name == "nt":
+        from crashkit.campaign.box import CampaignError
+
+        raise CampaignError(
+            "campaigns need Linux or macOS, for their locks and to end a solver with all it started; on Windows use WSL"
+        )
     from crashkit.campaign.campaign import Campaign
     from crashkit.campaign.status import write_page
     from crashkit.campaign.study import length_of

@@ -8,13 +8,14 @@ FOLDER/crash.zarr        the dataset; FOLDER/model/ the surrogate; FOLDER/status
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import fcntl
 import hashlib
 import json
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from crashkit.campaign.executors import Executor, Local, Slurm
 from crashkit.campaign.study import Study, read_study
 from crashkit.campaign.table import Run, Table
 from data_schema.progress import Progress, silent
+from data_schema.replace import beside
 
 _STARTING = 10.0  # seconds in which a job that was started has its lock
 _POLL = 0.2  # seconds between two looks at the jobs
@@ -69,15 +71,15 @@ class Campaign:
             raise CampaignError(
                 f"{self.folder}: another process runs a campaign there; wait for it, or stop it"
             ) from error
-        try:
+        with contextlib.ExitStack() as undo:
+            undo.callback(self._lock.close)
             self.table = Table(self.folder)
+            undo.callback(self.table.close)
             self._claim()
-        except BaseException:
-            self._lock.close()
-            raise
-        self.executor = executor or (
-            Slurm(self.folder, study.slurm, study.timeout) if study.executor == "slurm" else Local()
-        )
+            self.executor = executor or (
+                Slurm(self.folder, study.slurm, study.timeout) if study.executor == "slurm" else Local()
+            )
+            undo.pop_all()
 
     def __enter__(self) -> Campaign:
         return self
@@ -143,10 +145,9 @@ class Campaign:
     def write_parameters(self) -> Path:
         """Write runs.csv: one row per run that is done, units in the heads."""
         path = self.folder / "runs.csv"
-        beside = path.with_suffix(".partial")
         study = self.study
         try:
-            with beside.open("w", newline="", encoding="utf-8") as file:
+            with beside(path) as new, new.open("w", newline="", encoding="utf-8") as file:
                 rows = csv.writer(file)
                 rows.writerow(
                     [
@@ -156,7 +157,6 @@ class Campaign:
                 )
                 for run in self.table.runs("done"):
                     rows.writerow([run.name, *(repr(run.parameters[n]) for n in study.names)])
-            beside.replace(path)
         except OSError as error:
             raise CampaignError(
                 f"{path}: cannot be written ({error.strerror or error}); free space, then start again"
@@ -291,7 +291,3 @@ class Campaign:
 
 def _hash(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def names_of(runs: Sequence[Run]) -> list[str]:
-    return [r.name for r in runs]

@@ -20,6 +20,7 @@ from types import FrameType
 from typing import Any
 
 from crashkit import siblings
+from data_schema.replace import beside
 
 LOG, ORDER, END, LOCK = "run.log", "job.json", "exit.json", "job.lock"
 
@@ -128,9 +129,8 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
 
 
 def _write(path: Path, value: Any) -> None:
-    beside = path.with_name(path.name + ".partial")
-    beside.write_text(json.dumps(value), encoding="utf-8")
-    beside.replace(path)
+    with beside(path) as new:
+        new.write_text(json.dumps(value), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from crashkit.campaign.box import CampaignError
 from crashkit.campaign.campaign import Campaign
 from crashkit.campaign.table import STATES
+from data_schema.replace import beside
 
 COLOURS = {"waiting": "#9aa5b1", "running": "#2f7ed8", "done": "#2e9e5b", "failed": "#d64545", "refused": "#e0902f"}
 _SIZE, _PAD = 150.0, 8.0
@@ -52,9 +54,13 @@ def write_page(campaign: Campaign) -> Path:
         now=datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M:%S UTC"),
     )  # fmt: skip
     page = campaign.folder / "status.html"
-    beside = page.with_suffix(".partial")
-    beside.write_text(text, encoding="utf-8")
-    beside.replace(page)
+    try:
+        with beside(page) as new:
+            new.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise CampaignError(
+            f"{page}: cannot be written ({error.strerror or error}); free space, then start the campaign again"
+        ) from error
     return page
 
 

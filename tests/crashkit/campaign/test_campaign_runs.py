@@ -185,6 +185,29 @@ def test_two_processes_cannot_run_one_campaign(study: Callable[..., Path], tmp_p
         Campaign(file, tmp_path / "out")
 
 
+def test_a_campaign_that_cannot_begin_leaves_its_folder_free(
+    study: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_cluster(*_: object) -> None:
+        raise CampaignError("no cluster")
+
+    monkeypatch.setattr("crashkit.campaign.campaign.Slurm", no_cluster)
+    with pytest.raises(CampaignError, match="no cluster"):
+        Campaign(study(extra="executor: slurm\n"), tmp_path / "out")
+    with Campaign(study(), tmp_path / "out") as campaign:
+        assert campaign.table.runs() == []
+
+
+def test_windows_is_told_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from types import SimpleNamespace
+
+    from crashkit.api import run_campaign
+
+    monkeypatch.setattr(run_campaign, "os", SimpleNamespace(name="nt"))
+    with pytest.raises(CampaignError, match=r"Linux or macOS.*WSL"):
+        run_campaign.run_campaign(tmp_path / "study.yaml")
+
+
 def test_another_deck_in_the_same_folder_is_refused(study: Callable[..., Path], tmp_path: Path) -> None:
     with Campaign(study(), tmp_path / "out") as campaign:
         campaign.add(POINTS[:1], "start")
