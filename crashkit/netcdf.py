@@ -7,12 +7,15 @@ handle of its file is read. So all of this package, and the datasets it gives aw
 from __future__ import annotations
 
 import contextlib
+import shutil
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from xarray.backends import FileManager, NetCDF4DataStore
+
+from crashkit.errors import OutputError
 
 if TYPE_CHECKING:
     import netCDF4
@@ -91,3 +94,15 @@ def handle(path: str | Path) -> Iterator[netCDF4.Dataset]:
         yield shared.acquire()
     finally:
         shared.close()
+
+
+@contextlib.contextmanager
+def writing(target: Path) -> Iterator[None]:
+    """What HDF5 says when the disk is full ("HDF error"), in words: OutputError."""
+    try:
+        yield
+    except RuntimeError as error:
+        free = shutil.disk_usage(target.parent).free >> 20
+        raise OutputError(
+            f"{target.name}: cannot be written ({error}); is the disk full? {free} MB are free in {target.parent}"
+        ) from error

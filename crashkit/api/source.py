@@ -64,7 +64,7 @@ def source_of(dataset: str | Path | xr.Dataset, hierarchy: Hierarchy | None = No
     """
     import xarray as xr
 
-    from crashkit.mesh.store import has_hierarchy, read_hierarchy
+    from crashkit.mesh.store import has_hierarchy, open_hierarchy
 
     if isinstance(dataset, xr.Dataset):
         name = _name(dataset)
@@ -76,7 +76,7 @@ def source_of(dataset: str | Path | xr.Dataset, hierarchy: Hierarchy | None = No
     with Source(str(path), path, None, None).opened() as opened:
         _fits(hierarchy, opened, str(path))
     stored = hierarchy is None and has_hierarchy(path)
-    return Source(str(path), path, None, read_hierarchy(path) if stored else hierarchy, stored)
+    return Source(str(path), path, None, open_hierarchy(path) if stored else hierarchy, stored)
 
 
 def _name(dataset: xr.Dataset) -> str:
@@ -103,7 +103,7 @@ def _on_disk(dataset: xr.Dataset) -> Hierarchy | None:
     import numpy as np
 
     from crashkit.dataset import open_dataset
-    from crashkit.mesh.store import has_hierarchy, read_hierarchy
+    from crashkit.mesh.store import has_hierarchy, open_hierarchy
 
     origin = dataset.encoding.get("source")
     if not origin or not Path(origin).exists() or not has_hierarchy(origin):
@@ -115,7 +115,7 @@ def _on_disk(dataset: xr.Dataset) -> Hierarchy | None:
             *(["reference_position"] if "sim" not in stored["reference_position"].dims else []),
         ]
         same = all(np.array_equal(stored[name].values, dataset[name].values) for name in names)
-    return read_hierarchy(origin) if same else None
+    return open_hierarchy(origin) if same else None
 
 
 def _fits(hierarchy: Hierarchy | None, dataset: xr.Dataset, name: str) -> None:

@@ -101,7 +101,6 @@ def from_arrays(
     import xarray as xr
 
     from crashkit.dataset import open_dataset
-    from crashkit.ingestion import store
     from data_schema import dataset_checksum, digests_of_run, run_checksum, validate
 
     target = _free(Path(output)) if output is not None else None
@@ -181,7 +180,7 @@ def from_arrays(
         raise DataError(f"{where}{hint}{more}")
     if target is None:
         return ds
-    _write(ds, target, store)
+    _write(ds, target)
     return open_dataset(target)
 
 
@@ -337,8 +336,9 @@ def _free(output: Path) -> Path:
     return output
 
 
-def _write(ds: xr.Dataset, target: Path, store: Any) -> None:
+def _write(ds: xr.Dataset, target: Path) -> None:
     """As ingest writes it: the same chunks and checksums of chunks."""
+    from crashkit.ingestion import store
     from data_schema.checksum import results
     from data_schema.replace import put_in_place, room_beside
 
@@ -349,9 +349,14 @@ def _write(ds: xr.Dataset, target: Path, store: Any) -> None:
         )
         for name in names
     ]
-    with room_beside(target) as room:
-        store.zarr_from(ds, specs, room / "runs.zarr")
-        sources = [store.RunSource(room / "runs.zarr", k) for k in range(ds.sizes["sim"])]
-        write = store.write_netcdf if target.suffix == ".nc" else store.write_zarr
-        write(room / f"whole{target.suffix}", ds.drop_vars(names), specs, sources)
-        put_in_place(room / f"whole{target.suffix}", target, durable=True)
+    try:
+        with room_beside(target) as room:
+            store.zarr_from(ds, specs, room / "runs.zarr")
+            sources = [store.RunSource(room / "runs.zarr", k) for k in range(ds.sizes["sim"])]
+            write = store.write_netcdf if target.suffix == ".nc" else store.write_zarr
+            write(room / f"whole{target.suffix}", ds.drop_vars(names), specs, sources)
+            put_in_place(room / f"whole{target.suffix}", target, durable=True)
+    except OSError as error:
+        raise OutputError(
+            f"output: {target} cannot be written ({error.strerror or error}); check permissions and free space"
+        ) from error

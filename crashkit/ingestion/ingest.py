@@ -489,9 +489,9 @@ def _hierarchy_of(former: Existing | None) -> Hierarchy | None:
     """The mesh hierarchy of the dataset that is replaced, None where it has none."""
     if former is None or not former.has_hierarchy:
         return None
-    from crashkit.mesh.store import read_hierarchy
+    from crashkit.mesh.store import open_hierarchy
 
-    return read_hierarchy(former.path)
+    return open_hierarchy(former.path)
 
 
 def _carried(output: Path, hierarchy: Hierarchy) -> str:

@@ -13,7 +13,7 @@ import os
 import shutil
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -190,10 +190,12 @@ def write_netcdf(target: Path, small: xr.Dataset, specs: Sequence[ArraySpec], ru
     """The same content as `write_zarr`, as one NetCDF4 file, copied block by block."""
     import netCDF4
 
+    from crashkit.netcdf import writing
+
     sizes = {str(d): n for d, n in small.sizes.items()} | {"sim": len(runs)}
     for spec in specs:
         sizes |= dict(zip(spec.dims, spec.shape))
-    with _whole_file(target), netCDF4.Dataset(str(target), "w") as out:
+    with writing(target), netCDF4.Dataset(str(target), "w") as out:
         out.setncatts(small.attrs)
         for dim, size in sizes.items():
             out.createDimension(dim, size)
@@ -208,18 +210,6 @@ def write_netcdf(target: Path, small: xr.Dataset, specs: Sequence[ArraySpec], ru
             for place, source in enumerate(runs):
                 for block, values in _stored_blocks(source, spec):
                     written[(place, *block)] = values
-
-
-@contextmanager
-def _whole_file(target: Path) -> Iterator[None]:
-    """What HDF5 says when the disk is full ("HDF error"), in words."""
-    try:
-        yield
-    except RuntimeError as error:
-        free = shutil.disk_usage(target.parent).free >> 20
-        raise OutputError(
-            f"{target.name}: cannot be written ({error}); is the disk full? {free} MB are free in {target.parent}"
-        ) from error
 
 
 def _create(

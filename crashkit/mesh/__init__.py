@@ -15,7 +15,7 @@ _LAZY = {
     "Surface": "surface",
     "build_hierarchy": "hierarchy",
     "level_displacement": "store",
-    "read_hierarchy": "store",
+    "open_hierarchy": "store",
     "summarize_hierarchy": "store",
     "write_hierarchy": "store",
     "write_levels": "export",

@@ -26,7 +26,7 @@ from crashkit.dataset import open_dataset, reading_dataset
 from crashkit.errors import DataError, OutputError, ReadError
 from crashkit.mesh.levels import Hierarchy
 from crashkit.mesh.lifting import LiftingError, LiftingMeter
-from crashkit.netcdf import handle, open_netcdf
+from crashkit.netcdf import handle, open_netcdf, writing
 from crashkit.readers.base import split_states
 from data_schema.levels import Level
 from data_schema.progress import Progress
@@ -35,13 +35,6 @@ from data_schema.replace import beside, put_in_place, room_beside
 if TYPE_CHECKING:
     import xarray as xr
     from scipy import sparse
-from typing import TYPE_CHECKING
-
-import xarray as xr
-
-if TYPE_CHECKING:
-    from crashkit.mesh.levels import Hierarchy
-
 
 # Bytes of displacement held at once while streaming: mostly a whole run, since its chunks hold all states.
 _BUDGET = 512 << 20
@@ -87,8 +80,18 @@ def write_hierarchy(path: str | Path, hierarchy: Hierarchy, *, report: Progress 
     return errors
 
 
-def read_hierarchy(path: str | Path) -> Hierarchy:
-    """The hierarchy stored in the dataset at `path`.
+def open_hierarchy(path: str | Path) -> Hierarchy:
+    """The mesh hierarchy stored in the dataset at `path`, read whole.
+
+    Parameters
+    ----------
+    path
+        A crash dataset, `.zarr` or `.nc`, with a hierarchy made by `coarsen`.
+
+    Returns
+    -------
+    Hierarchy
+        Its levels (`hierarchy[1]` is the finest coarse one), with nodes, faces, edges and the maps between them.
 
     Raises
     ------
@@ -492,7 +495,7 @@ def _target(path: Path) -> Iterator[_Target]:
             put_in_place(room / "hierarchy", path / "hierarchy", durable=True)
         _consolidate_again(path)
     else:
-        with beside(path, durable=True) as new:
+        with writing(path), beside(path, durable=True) as new:
             _copy_without_hierarchy(path, new)
             target = _NetcdfTarget(new)
             try:
@@ -558,10 +561,3 @@ def has_hierarchy(path: str | Path) -> bool:
         return (path / "hierarchy").is_dir()
     with handle(path) as file:
         return "hierarchy" in file.groups
-
-
-def open_hierarchy(path: str | Path) -> Hierarchy:
-    """The mesh hierarchy of the dataset at `path`; raises DataError if it has none."""
-    from crashkit.mesh.store import read_hierarchy
-
-    return read_hierarchy(path)

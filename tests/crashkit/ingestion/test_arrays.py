@@ -68,6 +68,16 @@ def test_it_is_written_as_it_is(suffix: str, tmp_path: Path) -> None:
         crashkit.from_arrays(**given, output=tmp_path / f"plate{suffix}")
 
 
+def test_a_full_disk_is_told_in_one_line_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("crashkit.ingestion.store.zarr_from", full)
+    with pytest.raises(CrashkitError, match=r"output: .*plate\.zarr cannot be written \(No space left on device\)"):
+        crashkit.from_arrays(**arrays(side=3, runs=2), output=tmp_path / "plate.zarr")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_node_without_living_faces_may_be_missing() -> None:
     given = arrays(side=3, runs=2)
     alive = np.ones((2, len(given["time"]), len(given["faces"])), bool)

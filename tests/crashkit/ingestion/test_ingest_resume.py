@@ -271,14 +271,14 @@ class TestSecondIngest:
 
     def test_the_hierarchy_goes_on_with_the_new_runs(self, tmp_path: Path, sources, suffix: str) -> None:  # type: ignore[no-untyped-def]
         from crashkit.api.coarsen import coarsen
-        from crashkit.mesh.store import level_displacement, read_hierarchy
+        from crashkit.mesh.store import level_displacement, open_hierarchy
 
         output = tmp_path / f"crash{suffix}"
         self.ingest(tmp_path, suffix, sources[0])
         coarsen(output, [300])
-        before = read_hierarchy(output)
+        before = open_hierarchy(output)
         summary = self.ingest(tmp_path, suffix, sources[1])
-        after = read_hierarchy(output)
+        after = open_hierarchy(output)
         assert np.array_equal(after[1].kept, before[1].kept)
         assert any("hierarchy (300 nodes) goes on with the new runs" in note for note in summary.notes)
         runs = open_dataset(output, chunks=None)

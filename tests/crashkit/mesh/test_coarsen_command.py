@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 import crashkit
 from crashkit.cli import app
 from crashkit.errors import MeshError
-from crashkit.mesh import read_hierarchy
+from crashkit.mesh import open_hierarchy
 
 
 @pytest.fixture
@@ -31,13 +31,13 @@ def run(*arguments: object) -> tuple[int, str, str]:
 def test_levels_are_stored_and_told_with_their_lifting_errors(path: Path) -> None:
     code, out, _ = run(path, "--nodes", "120,30")
     assert code == 0
-    assert [level.n_nodes for level in read_hierarchy(path).levels] == [120, 30]
+    assert [level.n_nodes for level in open_hierarchy(path).levels] == [120, 30]
     assert "interpolation" in out.replace("\n", " ")
 
 
 def test_the_default_keeps_an_eighth_a_quarter_and_a_quarter(path: Path) -> None:
     assert run(path)[0] == 0
-    assert [level.n_nodes for level in read_hierarchy(path).levels] == [300, 75, 19]
+    assert [level.n_nodes for level in open_hierarchy(path).levels] == [300, 75, 19]
 
 
 def test_ratios_and_json(path: Path) -> None:
@@ -62,7 +62,7 @@ def test_a_picture_shows_all_levels_side_by_side(path: Path, tmp_path: Path) -> 
 
 def test_every_level_is_a_vtp_with_node_ids_and_probe_weights(path: Path, tmp_path: Path) -> None:
     assert run(path, "--nodes", "120,30", "--vtp", tmp_path / "levels")[0] == 0
-    hierarchy = read_hierarchy(path)
+    hierarchy = open_hierarchy(path)
     full, one, two = (pv.read(tmp_path / "levels" / f"level_{k}.vtp") for k in range(3))
     assert [m.n_points for m in (full, one, two)] == [2400, 120, 30]
     assert (one["node_id"] == hierarchy[1].kept + 1).all()
@@ -80,7 +80,7 @@ def test_every_level_is_a_vtp_with_node_ids_and_probe_weights(path: Path, tmp_pa
 
 def test_the_python_function_does_the_same(path: Path) -> None:
     hierarchy = crashkit.coarsen(path, nodes=[120, 30])
-    assert (hierarchy[2].kept == read_hierarchy(path)[2].kept).all()
+    assert (hierarchy[2].kept == open_hierarchy(path)[2].kept).all()
     with pytest.raises(MeshError, match="both node counts and ratios were given"):
         crashkit.coarsen(path, nodes=[120], ratios=[8])
 
@@ -138,7 +138,7 @@ def test_outputs_that_cannot_be_written_are_told_and_the_hierarchy_is_kept(path:
         code, _, err = run(path, "--nodes", "120,30", option, place)
         assert code == 1
         assert "cannot be written" in err.splitlines()[-1]
-        assert [level.n_nodes for level in read_hierarchy(path).levels] == [120, 30]
+        assert [level.n_nodes for level in open_hierarchy(path).levels] == [120, 30]
 
 
 def test_a_machine_that_cannot_draw_gets_the_hierarchy_and_the_reason(
@@ -151,7 +151,7 @@ def test_a_machine_that_cannot_draw_gets_the_hierarchy_and_the_reason(
     assert code == 0
     assert "no image can be drawn" in err
     assert not (tmp_path / "levels.png").exists()
-    assert len(read_hierarchy(path).levels) == 2
+    assert len(open_hierarchy(path).levels) == 2
 
 
 def with_beam(path: Path, *, own_faces: bool) -> Path:

@@ -16,7 +16,7 @@ from crashkit.errors import DataError, OutputError, ReadError
 from crashkit.mesh import (
     build_hierarchy,
     level_displacement,
-    read_hierarchy,
+    open_hierarchy,
     store,
     summarize_hierarchy,
     write_hierarchy,
@@ -77,7 +77,7 @@ def write(dataset: xr.Dataset, path: Path) -> None:
 
 def test_what_was_written_is_read_back(path: Path, hierarchy: Hierarchy) -> None:
     write_hierarchy(path, hierarchy)
-    back = read_hierarchy(path)
+    back = open_hierarchy(path)
     assert back.n_nodes == hierarchy.n_nodes
     assert back.settings == hierarchy.settings
     for a, b in zip(hierarchy.levels, back.levels, strict=True):
@@ -126,7 +126,7 @@ def test_a_new_hierarchy_replaces_the_old_one(path: Path, hierarchy: Hierarchy) 
     write_hierarchy(path, hierarchy)
     position, faces, _ = kart()
     write_hierarchy(path, build_hierarchy(position, faces, [50]))
-    assert [level.n_nodes for level in read_hierarchy(path).levels] == [50]
+    assert [level.n_nodes for level in open_hierarchy(path).levels] == [50]
     with pytest.raises(DataError, match="level 2 was asked for; the hierarchy has levels 1 to 1"):
         level_displacement(path, 2)
 
@@ -146,7 +146,7 @@ def test_a_failure_in_the_middle_leaves_the_old_hierarchy(path: Path, hierarchy:
 
     with pytest.raises(KeyboardInterrupt):
         write_hierarchy(path, build_hierarchy(position, faces, [50]), report=stop)
-    assert [level.n_nodes for level in read_hierarchy(path).levels] == [120, 30]
+    assert [level.n_nodes for level in open_hierarchy(path).levels] == [120, 30]
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 
 
@@ -162,9 +162,9 @@ def test_a_killed_process_leaves_the_dataset_and_the_next_one_succeeds(path: Pat
     )
     assert subprocess.run([sys.executable, "-c", script, str(path)], check=False).returncode == 9
     with pytest.raises(DataError, match="has no mesh hierarchy"):
-        read_hierarchy(path)
+        open_hierarchy(path)
     write_hierarchy(path, hierarchy)
-    assert [level.n_nodes for level in read_hierarchy(path).levels] == [120, 30]
+    assert [level.n_nodes for level in open_hierarchy(path).levels] == [120, 30]
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 
 
@@ -180,7 +180,7 @@ def test_missing_displacements_stay_missing(zarr_path: Path, tmp_path: Path, hie
 
 
 def test_a_dataset_without_a_hierarchy_says_what_to_do(path: Path) -> None:
-    for read in (read_hierarchy, summarize_hierarchy, lambda p: level_displacement(p, 1)):
+    for read in (open_hierarchy, summarize_hierarchy, lambda p: level_displacement(p, 1)):
         with pytest.raises(DataError, match=f"{path.name}: has no mesh hierarchy; run crashkit coarsen"):
             read(path)
 
@@ -193,7 +193,7 @@ def test_a_hierarchy_of_another_mesh_is_refused(zarr_path: Path, hierarchy: Hier
     write(moved, other)
     (zarr_path / "hierarchy").rename(other / "hierarchy")
     with pytest.raises(DataError, match="belongs to another mesh; run crashkit coarsen"):
-        read_hierarchy(other)
+        open_hierarchy(other)
 
 
 def test_a_hierarchy_made_before_runs_were_added_is_refused(zarr_path: Path, hierarchy: Hierarchy) -> None:
@@ -219,7 +219,7 @@ def test_a_damaged_map_is_noticed(zarr_path: Path, hierarchy: Hierarchy) -> None
     assert isinstance(indices, zarr.Array)
     indices[5] = 10_000
     with pytest.raises(ReadError, match=r"/hierarchy/level_1 is damaged .*; run crashkit coarsen again"):
-        read_hierarchy(zarr_path)
+        open_hierarchy(zarr_path)
 
 
 def test_a_full_disk_is_told_in_one_line_and_leaves_nothing(
@@ -228,11 +228,20 @@ def test_a_full_disk_is_told_in_one_line_and_leaves_nothing(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(store, "_write_level", full)
-    with pytest.raises(OutputError, match=r"the hierarchy cannot be written \(No space left on device\)") as caught:
-        write_hierarchy(path, hierarchy)
-    assert "\n" not in str(caught.value)
-    assert [p.name for p in path.parent.iterdir()] == [path.name]
+    def full_of_hdf5(*_: object) -> None:
+        raise RuntimeError("NetCDF: HDF error")
+
+    for fault, told in (
+        (full, r"the hierarchy cannot be written \(No space left on device\)"),
+        (full_of_hdf5, "HDF error"),
+    ):
+        if fault is full_of_hdf5 and path.suffix != ".nc":
+            continue
+        monkeypatch.setattr(store, "_write_level", fault)
+        with pytest.raises(OutputError, match=told) as caught:
+            write_hierarchy(path, hierarchy)
+        assert "\n" not in str(caught.value)
+        assert [p.name for p in path.parent.iterdir()] == [path.name]
 
 
 def test_the_mesh_of_the_first_run_is_taken_where_runs_differ_in_shape(tmp_path: Path) -> None:
@@ -254,7 +263,7 @@ def test_a_refined_hierarchy_is_stored_as_any_other(zarr_path: Path, hierarchy: 
     error = np.linalg.norm(position - position[0], axis=1)
     refined = refine(surface(position, faces), hierarchy, 2, error, nodes=60)
     write_hierarchy(zarr_path, refined)
-    again = read_hierarchy(zarr_path)
+    again = open_hierarchy(zarr_path)
     assert [level.n_nodes for level in again.levels] == [60, hierarchy[2].n_nodes]
     with xr.open_dataset(zarr_path, engine="zarr", consolidated=False) as dataset:
         fine = dataset["displacement"].values
