@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crashkit.campaign import job, quality
+from crashkit import quality
+from crashkit.campaign import job
 from crashkit.campaign.box import CampaignError
 from crashkit.campaign.deck import arguments, check_template, program_of, template_files, write_deck
 from crashkit.campaign.executors import Executor, Local, Slurm
