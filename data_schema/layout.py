@@ -164,6 +164,21 @@ VARIABLES: Mapping[str, Variable] = MappingProxyType(
             _variable(
                 "channel_note", "channel", kind="U", unit="", meaning="what was done to the solver's own numbers"
             ),
+            *(
+                _variable(name, "sim", kind="f", unit="%", meaning=f"{meaning}; NaN where nothing says")
+                for name, meaning in (
+                    ("energy_error", "largest error of the energy balance, of the largest total energy"),
+                    ("hourglass_share", "largest hourglass energy, of the largest internal energy"),
+                    ("mass_added", "mass added by mass scaling"),
+                )
+            ),
+            _variable(
+                "quality_note",
+                "sim",
+                kind="U",
+                unit="",
+                meaning="what of the run is beyond its limit; empty where it is fine",
+            ),
             _variable("complete", "sim", kind="b", unit="", meaning="every state was found and the end time reached"),
         )
     }

@@ -36,6 +36,9 @@ def describe_dataset(dataset: xr.Dataset, path: Path) -> dict[str, Any]:
         "units_read": known.get("units_read"),
         "runs": size["sim"],
         "incomplete_runs": [str(n) for n in dataset["sim"].values[~dataset["complete"].values]] if "complete" in dataset else [],
+        "marked_runs": {
+            str(n): str(note) for n, note in zip(dataset["sim"].values, dataset["quality_note"].values, strict=True) if note
+        } if "quality_note" in dataset else {},
         "states": size["time"],
         "time_begin": float(dataset["time"].values[0]),
         "time_end": float(dataset["time"].values[-1]),

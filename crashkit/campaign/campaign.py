@@ -16,6 +16,8 @@ import json
 import shutil
 import time
 from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -221,8 +223,8 @@ class Campaign:
         if ended.reason or ended.code:
             log = job.last_lines(place)
             return "failed", (ended.reason or f"ended with {ended.code}") + (f": {log}" if log else ""), {}
-        verdict = quality.look(place)
-        found = {k: v for k in ("energy_error", "mass_added") if (v := getattr(verdict, k)) is not None}
+        verdict = self._quality(run)
+        found = verdict.values
         finished = self.study.finished
         if finished is not None and not quality.says(place, finished.file, finished.text):
             return (
@@ -232,19 +234,27 @@ class Campaign:
             )
         if finished is None and verdict.ended is False:
             return "failed", f"ended with 0, but not normally: {job.last_lines(place)}", found
-        if verdict.still:
-            return "refused", "all energies are zero: nothing moved; check the deck's initial velocity", found
         if not self._wrote(run):
             return (
                 "failed",
                 f"ended with 0, but wrote no results ({self.study.results or 'any file'}): {job.last_lines(place)}",
                 found,
             )
-        for name, value in found.items():
-            limit = getattr(self.study.quality, name)
-            if limit is not None and value > limit:
-                return "refused", f"{name.replace('_', ' ')} {value:.3g} %, the limit is {limit:g} %", found
-        return "done", "", found
+        wrong = replace(verdict, ended=None).beyond(self.study.quality.model_dump())
+        return ("refused", wrong[0], found) if wrong else ("done", "", found)
+
+    def _quality(self, run: Run) -> quality.Quality:
+        """What the solver printed, and what its time histories know better where they can be read."""
+        from crashkit.errors import ReadError
+        from crashkit.readers import reader_for
+
+        printed = quality.look(self._place(run))
+        result = self._result(run)
+        try:
+            with closing(next(iter(reader_for(result).runs(result)))) as read:
+                return quality.measured(read.history(), printed)
+        except (ReadError, StopIteration):
+            return printed
 
     def _wrote(self, run: Run) -> bool:
         """Whether the solver left something that ingest can read."""

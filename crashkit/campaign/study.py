@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from crashkit.campaign.box import Box, CampaignError, checked, read_yaml
+from crashkit.quality import LIMITS
 
 
 def _split(value: Any) -> Any:
@@ -48,8 +49,9 @@ class Finished(_Strict):
 class Quality(_Strict):
     """Limits of a run, in per cent; a run beyond one of them is refused. None: no limit."""
 
-    energy_error: float | None = Field(15.0, gt=0)
-    mass_added: float | None = Field(10.0, gt=0)
+    energy_error: float | None = Field(LIMITS["energy_error"], gt=0)
+    hourglass_share: float | None = Field(LIMITS["hourglass_share"], gt=0)
+    mass_added: float | None = Field(LIMITS["mass_added"], gt=0)
 
 
 class Design(_Strict):
@@ -110,7 +112,7 @@ class Study(Box):
     command: Command
     results: str = ""
     finished: Finished | None = None
-    quality: Quality = Quality(energy_error=15.0, mass_added=10.0)
+    quality: Quality = Quality.model_validate({})
     at_a_time: int = Field(1, ge=1)
     timeout: Duration = 24 * 3600.0
     retries: int = Field(0, ge=0)

@@ -86,6 +86,8 @@ def _print_dataset(found: dict[str, Any]) -> None:
     line("solver", f"{found['solver']}; read in {found['units_read']}, kept in SI")
     incomplete = found["incomplete_runs"]
     line("runs", f"{found['runs']}" + (f", incomplete: {_listed(incomplete)}" if incomplete else ""))
+    if found["marked_runs"]:
+        line("marked", _listed([f"{run} ({why})" for run, why in found["marked_runs"].items()], most=3))
     moved = found["alignment_error"]
     line(
         "states",

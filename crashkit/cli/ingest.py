@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
 
 # More common times than this are a slip of the keyboard.
 _MOST_TIMES = 100_000
+# Marked runs that are told one by one.
+_MOST_MARKED = 10
 
 
 def command(
@@ -58,6 +61,19 @@ def command(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace runs that the dataset already holds.")
     ] = False,
+    quality: Annotated[
+        str,
+        typer.Option(
+            help="Runs whose energy balance, hourglass energy, added mass or end is beyond its limit: mark or refuse them."
+        ),
+    ] = "mark",
+    limit: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Another limit, in per cent: energy_error=5, hourglass_share=10, mass_added=none. Repeat for more.",
+            show_default="15, 10, 10",
+        ),
+    ] = None,
     workers: Annotated[int, typer.Option(help="Number of processes on this machine.", min=1)] = 1,
     scheduler: Annotated[
         str | None, typer.Option(help="Use this Dask scheduler (address) instead.", show_default="none")
@@ -74,6 +90,9 @@ def command(
 
     if on_error not in ("stop", "skip"):
         raise typer.BadParameter(f"{on_error!r}; expected stop or skip", param_hint="--on-error")
+    if quality not in ("mark", "refuse"):
+        raise typer.BadParameter(f"{quality!r}; expected mark or refuse", param_hint="--quality")
+    limits = _limits(limit or ())
     with Progress("looking for runs", quiet=json) as shown:
         try:
             summary = ingest(
@@ -81,7 +100,8 @@ def command(
                 names=run_names, parts=names(parts), exclude_parts=names(exclude_parts),
                 keep_rigid_walls=keep_rigid_walls, fields=names(fields), time=_times(time),
                 on_error="skip" if on_error == "skip" else "stop", allow_incomplete=allow_incomplete,
-                overwrite=overwrite, workers=workers, scheduler=scheduler,
+                overwrite=overwrite, quality="refuse" if quality == "refuse" else "mark", limits=limits,
+                workers=workers, scheduler=scheduler,
                 report=shown.step,
             )  # fmt: skip
         except KeyboardInterrupt:
@@ -101,6 +121,10 @@ def show(summary: IngestSummary) -> None:
         say(f"  {note}")
     for run, reason in summary.skipped.items():
         say(f"  skipped {run}: {reason}")
+    for run, reason in list(summary.marked.items())[:_MOST_MARKED]:
+        say(f"  marked {run}: {reason}")
+    if len(summary.marked) > _MOST_MARKED:
+        say(f"  and {len(summary.marked) - _MOST_MARKED} more runs marked: see quality_note in the dataset")
     errors = summary.alignment_error
     if any(errors.values()):
         table(
@@ -121,6 +145,21 @@ def show(summary: IngestSummary) -> None:
     if summary.question:
         say(f"  {summary.question}")
     say(f"{summary.output}: {len(summary.runs)} runs ({told}{resumed}), {summary.states} states, {summary.nodes} nodes")
+
+
+def _limits(texts: Iterable[str]) -> dict[str, float | None]:
+    out: dict[str, float | None] = {}
+    for text in texts:
+        name, equals, value = (piece.strip() for piece in text.partition("="))
+        try:
+            out[name] = None if value == "none" else float(value.removesuffix("%"))
+            if not equals or not (out[name] or 0.0) >= 0:
+                raise ValueError
+        except ValueError as error:
+            raise typer.BadParameter(
+                f"{text!r}; expected NAME=PER CENT, such as energy_error=5 or mass_added=none", param_hint="--limit"
+            ) from error
+    return out
 
 
 def _times(text: str) -> list[float] | None:

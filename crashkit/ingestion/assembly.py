@@ -20,9 +20,10 @@ from crashkit.ingestion.store import ArraySpec, RunSource
 from crashkit.ingestion.structure import Structure
 from crashkit.ingestion.survey import Found
 from crashkit.ingestion.transfer import Layout
+from crashkit.quality import MEASURES, Quality
 from crashkit.readers.base import Part
 from crashkit.version import __version__
-from data_schema import CONVENTIONS, dataset_checksum, digests_of_run, parameters, run_checksum, validate
+from data_schema import CONVENTIONS, VARIABLES, dataset_checksum, digests_of_run, parameters, run_checksum, validate
 from data_schema import fields as fields_of
 from data_schema.replace import put_in_place, remove
 
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 # Variables that chunks are moved for; everything else is small and written anew.
-_SMALL = ("alignment_error", "complete", "run_checksum", "source_time", *CURVES)
+_SMALL = ("alignment_error", "complete", "run_checksum", "source_time", "quality_note", *MEASURES, *CURVES)
 
 
 @dataclass(frozen=True)
@@ -118,8 +119,11 @@ def publish(
     staged: Mapping[str, StagedRun],
     old: Existing | None,
     hashes: BackgroundHashes,
+    marked: Mapping[str, str],
 ) -> tuple[str, ...]:
     """Put the dataset together in the staging folder, then in its place; returns the names of its runs, in order.
+
+    `marked` says of new runs what is beyond its limit.
 
     Runs of `old` that are not among `fresh` are kept, unread where the output is a Zarr folder.
     """
@@ -134,7 +138,7 @@ def publish(
     specs = layout.specs(alive=has("alive"), cell_alive=has("cell_alive"))
     kept_in = _kept_store(staging, old, specs) if old is not None and kept else Path()
     runs = [RunSource(staging.place(staged[n].key), 0) if n in new else RunSource(kept_in, before[n]) for n in names]
-    small = _small(layout, names, new, staged, old, runs, hashes)
+    small = _small(layout, names, new, staged, old, runs, hashes, marked)
     write = store.write_netcdf if staging.output.suffix == ".nc" else store.write_zarr
     remove(staging.whole)
     write(staging.whole, small, specs, runs)
@@ -163,6 +167,7 @@ def _small(
     old: Existing | None,
     runs: Sequence[RunSource],
     hashes: BackgroundHashes,
+    marked: Mapping[str, str],
 ) -> xr.Dataset:
     """Coordinates, mesh, parameters and attributes: everything but the results."""
     import xarray as xr
@@ -172,7 +177,7 @@ def _small(
     rows = [
         _OfRun.kept(old, n)
         if old is not None and n not in new
-        else _OfRun.new(new[n], staged[n], layout.time, read_curves(places[n]))
+        else _OfRun.new(new[n], staged[n], layout.time, read_curves(places[n]), marked.get(n, ""))
         for n in names
     ]
     ds = xr.Dataset(
@@ -212,6 +217,12 @@ def _small(
     if any(r.source_time is not None for r in rows):
         ds["source_time"] = (("sim", "source_state"), _padded(rows, layout.time), {"units": "s"})
     ds = with_curves(ds, [r.curves for r in rows])
+    for name in MEASURES:
+        measured = np.array([r.quality.get(name, np.nan) for r in rows], np.float64)
+        if np.isfinite(measured).any():
+            ds[name] = ("sim", measured, {"units": VARIABLES[name].unit, "long_name": MEASURES[name]})
+    if any(r.quality or r.quality_note for r in rows):
+        ds["quality_note"] = ("sim", np.array([r.quality_note for r in rows], dtype=str))
     units = old.parameters if old is not None else {n: u for n, (_, u) in fresh.parameters.items()}
     for name, unit in units.items():
         values = np.array([r.parameters[name] for r in rows], np.float64)
@@ -255,12 +266,18 @@ class _OfRun:
     parameters: Mapping[str, float]
     source_time: NDArray[np.float64] | None
     curves: Curves | None
+    quality: Mapping[str, float]
+    quality_note: str
 
     @classmethod
-    def new(cls, found: Found, staged: StagedRun, time: NDArray[np.float64], curves: Curves | None) -> _OfRun:
+    def new(
+        cls, found: Found, staged: StagedRun, time: NDArray[np.float64], curves: Curves | None, quality_note: str
+    ) -> _OfRun:
         own = None if same_time(found.time, time) else found.time
         values = {n: v for n, (v, _) in found.parameters.items()}
-        return cls(found.complete, staged.error, run_checksum(staged.digests), values, own, curves)
+        quality = Quality(**staged.quality).values
+        checksum = run_checksum(staged.digests)
+        return cls(found.complete, staged.error, checksum, values, own, curves, quality, quality_note)
 
     @classmethod
     def kept(cls, old: Existing, name: str) -> _OfRun:
@@ -274,6 +291,8 @@ class _OfRun:
             parameters={n: float(of[n]) for n in old.parameters},
             source_time=None if len(own) == 0 or same_time(own, old.time) else own,
             curves=curves_of(of),
+            quality={n: float(of[n]) for n in MEASURES if n in of and np.isfinite(of[n])},
+            quality_note=str(of["quality_note"].values) if "quality_note" in of else "",
         )
 
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from crashkit.readers.base import Run
+    from crashkit.readers.history import History
 
 # Variables of the dataset.
 CURVES = ("history", "history_time", "channel_unit", "channel_note")
@@ -35,8 +36,8 @@ class Curves:
     notes: tuple[str, ...]
 
 
-def write_curves(run: Run, units: str, folder: Path) -> None:
-    """Keep the curves of `run`, changed to SI, beside its arrays; nothing where it has none.
+def write_curves(run: Run, units: str, folder: Path) -> History | None:
+    """Keep the curves of `run`, changed to SI, beside its arrays; returns them as its source has them, None without any.
 
     Raises
     ------
@@ -49,7 +50,7 @@ def write_curves(run: Run, units: str, folder: Path) -> None:
     except ReadError as error:
         raise ReadError(f"{error}; or move the file away to ingest the run without its curves") from error
     if history is None:
-        return
+        return None
     system = unit_system(units)
     factors, names = [], []
     for channel in history.channels:
@@ -67,6 +68,7 @@ def write_curves(run: Run, units: str, folder: Path) -> None:
         units=np.array(names, dtype=str),
         notes=np.array([c.derived for c in history.channels], dtype=str),
     )
+    return history
 
 
 def read_curves(folder: Path) -> Curves | None:

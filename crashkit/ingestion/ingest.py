@@ -30,12 +30,17 @@ from crashkit.ingestion.structure import Structure
 from crashkit.ingestion.survey import Choice, Found, Survey, described, reader_options, survey
 from crashkit.ingestion.transfer import Layout, is_whole, let_memory_go, transfer
 from crashkit.parallel import as_finished
+from crashkit.quality import LIMITS, MEASURES, Limits, Quality
 from crashkit.version import __version__
 from data_schema import run_checksum
 from data_schema.progress import Progress
 
 if TYPE_CHECKING:
     from crashkit.mesh.levels import Hierarchy
+
+
+# Runs beyond a limit that are told one by one.
+_TOLD = 5
 
 
 @dataclass(frozen=True, repr=False)
@@ -54,6 +59,8 @@ class IngestSummary(Described):
         run -> why it is not in the dataset.
     alignment_error
         run -> estimated error of the change to the common times, m; of the runs written now.
+    marked
+        run -> what of it is beyond its limit (energy balance, hourglass energy, added mass, its end); it is in the dataset.
     notes
         What else is worth knowing, such as parts left out.
     scale
@@ -70,6 +77,7 @@ class IngestSummary(Described):
     resumed: int = 0
     skipped: Mapping[str, str] = field(default_factory=dict)
     alignment_error: Mapping[str, float] = field(default_factory=dict)
+    marked: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     nodes: int = 0
     states: int = 0
@@ -82,6 +90,7 @@ class IngestSummary(Described):
             "runs": len(self.runs),
             **{what: f"{len(names)}: {listed(names)}" for what, names in runs.items() if names},
             **{f"skipped {run}": why for run, why in self.skipped.items()},
+            **{f"marked {run}": why for run, why in self.marked.items()},
             "nodes": self.nodes,
             "states": self.states,
             **({"scale": self.scale} if self.scale is not None else {}),
@@ -109,6 +118,8 @@ def ingest(
     on_error: Literal["stop", "skip"] = "stop",
     allow_incomplete: bool = False,
     overwrite: bool = False,
+    quality: Literal["mark", "refuse"] = "mark",
+    limits: Mapping[str, float | None] | None = None,
     workers: int = 1,
     scheduler: str | None = None,
     report: Progress | None = None,
@@ -153,6 +164,12 @@ def ingest(
         Accept incomplete runs; their missing states are NaN.
     overwrite
         Replace runs that the dataset already contains; without it, they must be unchanged.
+    quality
+        What becomes of a run beyond a limit: "mark" it in the dataset (`quality_note`), or "refuse" it, which `on_error`
+        answers to.
+    limits
+        Largest values that are fine, per cent, over `crashkit.quality.LIMITS`: energy_error (15), hourglass_share (10),
+        mass_added (10); None: no limit. A run that did not end normally or has no energy is beyond them in any case.
     workers
         Number of processes on this machine (a script that uses several needs `if __name__ == "__main__":`).
     scheduler
@@ -166,6 +183,10 @@ def ingest(
     paths = [Path(sources)] if isinstance(sources, (str, Path)) else [Path(s) for s in sources]
     if on_error not in ("stop", "skip"):
         raise CrashkitError(f"on_error {on_error!r} is not known; expected stop or skip")
+    if quality not in ("mark", "refuse"):
+        raise CrashkitError(f"quality {quality!r} is not known; expected mark or refuse")
+    if unknown := sorted(set(limits or ()) - set(MEASURES)):
+        raise CrashkitError(f"there is no limit of {unknown[0]!r}; expected {', '.join(MEASURES)}")
     check_output(output)
     for path in paths:
         if not path.exists():
@@ -184,6 +205,8 @@ def ingest(
             wanted=None if time is None else np.asarray(time, np.float64),
             stop=on_error == "stop",
             overwrite=overwrite,
+            limits={**LIMITS, **(limits or {})},
+            refuse=quality == "refuse",
             tell=watched(report, progress),
         )
         try:
@@ -202,6 +225,8 @@ class _Job:
     wanted: NDArray[np.float64] | None
     stop: bool
     overwrite: bool
+    limits: Limits
+    refuse: bool
     tell: Progress
 
     def run(self, sources: list[Path], workers: _Workers) -> IngestSummary:
@@ -223,12 +248,13 @@ class _Job:
             staged = self._staged_before(fresh, keys)
             resumed = len(staged)
             self._transfer(fresh, keys, staged, layout, look, workers)
+            marked = self._beyond(staged, look)
             fresh = [f for f in fresh if f.name in staged]
             if not fresh:
                 raise DataError(f"no run can be used ({look.reasons()})")
             self.tell("ingest", len(fresh), len(fresh), "putting the dataset together")
             hierarchy = _hierarchy_of(former)
-            names = publish(staging, layout, fresh, staged, old, hashes)
+            names = publish(staging, layout, fresh, staged, old, hashes, marked)
         if hierarchy is not None:
             look.note(_carried(staging.output, hierarchy))
         _note_equal_parameters(fresh, staged, old, look)
@@ -243,6 +269,7 @@ class _Job:
             resumed=resumed,
             skipped=dict(look.skipped),
             alignment_error={f.name: staged[f.name].error for f in fresh},
+            marked=marked,
             notes=tuple(look.notes),
             nodes=layout.structure.n_nodes,
             states=len(layout.time),
@@ -374,6 +401,24 @@ class _Job:
             else:
                 look.refuse(todo[place].name, outcome, self.stop)
             self.tell("ingest", len(staged), len(fresh), todo[place].name)
+
+    def _beyond(self, staged: dict[str, StagedRun], look: Survey) -> dict[str, str]:
+        """Run -> what of it is beyond its limit; where such runs are refused, they leave `staged`."""
+        wrong = {name: "; ".join(Quality(**run.quality).beyond(self.limits)) for name, run in staged.items()}
+        beyond = {name: told for name, told in wrong.items() if told}
+        if not self.refuse or not beyond:
+            return beyond
+        if self.stop:
+            told = [f"run {name}: {what}" for name, what in list(beyond.items())[:_TOLD]]
+            more = [f"and {len(beyond) - _TOLD} more"] if len(beyond) > _TOLD else []
+            raise DataError(
+                f"{'; '.join([*told, *more])}; leave such runs out with --on-error skip, keep them with --quality mark, or "
+                "set another --limit"
+            )
+        for name, what in beyond.items():
+            del staged[name]
+            look.skipped[name] = what
+        return {}
 
 
 # --- who does the work -------------------------------------------------------------------------------------------

@@ -37,6 +37,8 @@ class StagedRun:
         Estimated error of the change to the common time, m.
     displacement, speed
         The largest of any living node, m and m/s.
+    quality
+        What is known of how good the run is, as `crashkit.quality.Quality` has it.
     """
 
     key: str
@@ -45,6 +47,7 @@ class StagedRun:
     error: float
     displacement: float
     speed: float
+    quality: Mapping[str, Any]
 
 
 class Staging:

@@ -12,7 +12,7 @@ import shutil
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from crashkit.ingestion.staging import StagedRun
 from crashkit.ingestion.store import ArraySpec, create_arrays
 from crashkit.ingestion.structure import Structure, matched
 from crashkit.ingestion.survey import Choice, Field, Found, reopen
+from crashkit.quality import Quality, look, measured
 from crashkit.readers.base import Run, split_states
 from data_schema import unit_system
 from data_schema.checksum import BlockDigest, array_digest, block_digest
@@ -119,13 +120,15 @@ def transfer(found: Found, layout: Layout, key: str, place: Path) -> StagedRun:
             with ThreadPoolExecutor(THREADS, thread_name_prefix="write") as pool:
                 work = _Transfer(run, found, layout, beside, pool)
                 digests, error = work.write()
-            write_curves(run, found.units, beside / "arrays")
+            history = write_curves(run, found.units, beside / "arrays")
+            printed = run.printed()
         finally:
             run.close()
         put_in_place(beside / "arrays", place)
     finally:
         shutil.rmtree(beside, ignore_errors=True)
-    return StagedRun(key, found.name, digests, error, work.displacement, work.speed)
+    quality = measured(history, Quality() if printed is None else look(*printed))
+    return StagedRun(key, found.name, digests, error, work.displacement, work.speed, asdict(quality))
 
 
 def is_whole(staged: StagedRun, place: Path) -> bool:

@@ -159,6 +159,10 @@ class Run(ABC):
         """The file that holds a state, for messages. Without a reader's own answer: of as many files as states, that one."""
         return self.files[state if len(self.files) == len(self.time) else 0]
 
+    def printed(self) -> tuple[Path, str] | None:
+        """Folder and name under which the solver printed how this run went, where it stands beside the results."""
+        return None
+
     def close(self) -> None:  # noqa: B027 - most readers hold nothing open
         """Let go of files."""
 

@@ -163,6 +163,11 @@ class _D3plotRun(Run):
     def file_of(self, state: int) -> Path:
         return self._file.states[state].file
 
+    def printed(self) -> tuple[Path, str] | None:
+        """messag or d3hsp of the folder; of a folder with several runs nobody knows whose they are."""
+        folder = self.files[0].parent
+        return (folder, "*") if len(_found_in(folder).runs) == 1 else None
+
     def _place(self, state: int) -> str:
         at = self._file.states[state]
         return f"{at.file}, state {state}, byte {at.offset}"

@@ -129,6 +129,10 @@ class _RadiossRun(Run):
     def file_of(self, state: int) -> Path:
         return self._states[state]
 
+    def printed(self) -> tuple[Path, str] | None:
+        """NAME_0001.out, where it stands beside the animation files."""
+        return self._states[0].parent, self._root
+
     # Files
 
     def _time(self, state: int) -> float:
