@@ -76,7 +76,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--every", type=int, default=1, help="take every so many-th state, from the first on")
     parser.add_argument("--nodes", default="300,75", help="nodes of the levels of mh")
     parser.add_argument("--odd", default="impact_angle", help="parameter that changes its sign in the mirror")
-    parser.add_argument("--set", action="append", default=[], help="a setting of all trainings, such as level.epochs=100")
+    parser.add_argument(
+        "--set", action="append", default=[], help="a setting of all trainings, such as level.epochs=100"
+    )
     parser.add_argument("--default-only", action="store_true", help="no alternatives: bands alone")
     parser.add_argument("-o", "--output", type=Path, default=Path())
     parser.add_argument("--table", nargs="*", type=Path, help="print the table of CSV files that are there")
@@ -262,7 +264,9 @@ def print_table(file: Path) -> None:
     if names:
         best = min(names, key=lambda name: columns[name].mean())
         each = default / np.min([columns[name] for name in names], axis=0)
-        print(f"\nBest fixed one on average: {best}. Beside the best of each split, known afterwards: {each.mean():.2f}.")
+        print(
+            f"\nBest fixed one on average: {best}. Beside the best of each split, known afterwards: {each.mean():.2f}."
+        )
     told = []
     for third in THIRDS:
         count, share = columns[f"runs {third}"], columns[f"inside {third}"]

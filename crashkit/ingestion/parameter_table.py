@@ -17,6 +17,7 @@ import io
 import json
 import math
 import re
+import unicodedata
 import zipfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -54,10 +55,14 @@ class _Percent(float):
 
 @dataclass(frozen=True)
 class ParameterTable:
-    """Rows by run name: parameter name -> (value, unit as written, "" where none is)."""
+    """Rows by run name: parameter name -> (value, unit as written, "" where none is).
+
+    notes  what to tell: columns that are left out though they hold numbers
+    """
 
     path: Path
     rows: Mapping[str, Mapping[str, tuple[float, str]]]
+    notes: tuple[str, ...] = ()
 
     def key(self, run: str) -> str:
         """The name of the row of `run`: its own, or the same number written otherwise where only one row is that.
@@ -71,6 +76,9 @@ class ParameterTable:
         """
         if run in self.rows:
             return run
+        same = [key for key in self.rows if _one_form(key) == _one_form(run)]
+        if len(same) == 1:
+            return same[0]
         number = re.search(r"\d+$", run)
         if number is not None and all(key.isdigit() for key in self.rows):
             alike = [key for key in self.rows if int(key) == int(number[0])]
@@ -95,6 +103,11 @@ class ParameterTable:
         return self.rows[self.key(run)]
 
 
+def _one_form(name: str) -> str:
+    """A name whose letters with accents are one character each: file systems and editors part them in their own ways."""
+    return unicodedata.normalize("NFC", name)
+
+
 def read_parameter_table(path: Path) -> ParameterTable:
     """The table at `path`, told by its suffix.
 
@@ -116,6 +129,7 @@ def read_parameter_table(path: Path) -> ParameterTable:
             f"{path}: no column called run; its columns are {', '.join(filter(None, table.header)) or 'none'}"
         )
     chosen = [k for k, c in enumerate(table.header) if k != key and _plain(c) not in _KEYS]
+    others = [k for k in range(len(table.header)) if k != key and k not in chosen]
     columns = parameter_columns([table.header[k] for k in chosen], [""] * len(chosen), str(path))
     body, below = _without_units_row(table, key, chosen)
     for k, (name, unit) in zip(chosen, columns, strict=True):
@@ -143,7 +157,20 @@ def read_parameter_table(path: Path) -> ParameterTable:
         raise DataError(f"{path}: more than one row for run {', '.join(dict.fromkeys(twice))}; keep one each")
     if not rows:
         raise ReadError(f"{path}: the table has no row")
-    return ParameterTable(path, rows)
+    notes = tuple(
+        f"{path}: column {table.header[k]!r} is taken for another name of the runs and is no parameter"
+        for k in others
+        if _holds_values(body, k, key)
+    )
+    return ParameterTable(path, rows, notes)
+
+
+def _holds_values(body: Sequence[tuple[int, list[Any]]], column: int, key: int) -> bool:
+    """Whether a column of names holds numbers that are not those of the runs."""
+    cells = [(_text(line[column]), _text(line[key])) for _, line in body]
+    return all(_PLAIN.fullmatch(text) for text, _ in cells) and any(
+        not run.endswith(text.lstrip("0") or "0") for text, run in cells
+    )
 
 
 @dataclass(frozen=True)

@@ -190,7 +190,9 @@ def survey(
             finally:
                 run.close()
     if table is not None:
-        by_number = [f"run {run} has row {key}" for key, run in used.items() if key != run]
+        for text in table.notes:
+            out.note(text)
+        by_number = [f"run {run} has row {key}" for key, run in used.items() if key.isdigit() and key != run]
         if by_number:
             more = f" and {len(by_number) - 3} more" if len(by_number) > 3 else ""
             out.note(f"{table.path}: knows runs by their numbers, so {', '.join(by_number[:3])}{more}")

@@ -23,6 +23,17 @@ _BY_SUFFIX = {
     ".key": "is an LS-DYNA deck, not a result; name its d3plot",
     ".rad": "is an OpenRadioss deck, not a result; name its animation files or their folder",
 }
+# First bytes -> what the file is packed with; told only where no reader takes the file as it is.
+_PACKED = {
+    b"\x1f\x8b": "gzip",
+    b"PK\x03\x04": "ZIP",
+    b"7z\xbc\xaf\x27\x1c": "7-Zip",
+    b"\xfd7zXZ\x00": "xz",
+    b"BZh": "bzip2",
+    b"\x28\xb5\x2f\xfd": "Zstandard",
+    b"Rar!": "RAR",
+}
+_TAR, _TAR_AT = b"ustar", 257
 _ONE_STATE = "one state without time; name the .pvd or the folder with all states, numbered"
 _BY_KIND = {
     "grid": f"is a VTK file with {_ONE_STATE}",
@@ -68,10 +79,15 @@ def _file(path: Path) -> str | None:
     if other := xml_type(path):
         return _named(path, f"is a VTK file of type {other}; expected UnstructuredGrid or PolyData with time")
     with path.open("rb") as stream:
-        start = stream.read(8)
+        start = stream.read(_TAR_AT + len(_TAR))
+    packed = next((name for mark, name in _PACKED.items() if start.startswith(mark)), None)
+    if packed is None and start[_TAR_AT:] == _TAR:
+        packed = "tar"
+    if packed is not None:
+        return _named(path, f"is packed with {packed}; unpack it first")
     if start[:3] == b"CDF" and start[3:4] in b"\x01\x02\x05":
         return _named(path, "is a classic NetCDF file and no Exodus file with states; write Exodus, or a crash dataset")
-    return _named(path, found) if start == _HDF5 and (found := _hdf5(path)) else None
+    return _named(path, found) if start.startswith(_HDF5) and (found := _hdf5(path)) else None
 
 
 def _hdf5(path: Path) -> str | None:

@@ -111,7 +111,7 @@ def _pvd_entries(file: Path) -> list[tuple[float | None, object, Path]]:
     for entry in _tree(file, "a PVD collection").iter("DataSet"):
         attributes = entry.attrib
         try:
-            time = float(attributes["timestep"]) if "timestep" in attributes else None
+            time = _seconds(attributes["timestep"]) if "timestep" in attributes else None
             path = file.parent / attributes["file"]
         except (KeyError, ValueError) as error:
             raise ReadError(
@@ -120,6 +120,11 @@ def _pvd_entries(file: Path) -> list[tuple[float | None, object, Path]]:
         part = tuple(attributes.get(name, "") for name in ("part", "group", "name"))
         entries.append((time, part if any(part) else None, path))
     return entries
+
+
+def _seconds(text: str) -> float:
+    """A time of a list; programs that run in German or French write it with a decimal comma."""
+    return float(text.replace(",", ".") if text.count(",") == 1 and "." not in text else text)
 
 
 def _series_entries(file: Path) -> list[tuple[float | None, object, Path]]:

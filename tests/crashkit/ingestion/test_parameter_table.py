@@ -269,3 +269,21 @@ def test_a_cell_at_the_end_of_a_sheet_takes_no_memory(tmp_path: Path) -> None:
     book["doe"].cell(1_000_000, 2, 4)
     book.save(path)
     assert read_parameter_table(path).rows == {"x": {"v": (3.0, "")}, "y": {"v": (4.0, "")}}
+
+
+def test_accents_written_in_two_ways_are_the_same(tmp_path: Path) -> None:
+    (tmp_path / "runs.csv").write_text("run,angle\nTu\u0308r 1,15\nT\u00fcr 2,20\n", encoding="utf-8")
+    table = read_parameter_table(tmp_path / "runs.csv")
+    assert table.row("T\u00fcr 1")["angle"] == (15.0, "")
+    assert table.row("Tu\u0308r 2")["angle"] == (20.0, "")
+
+
+@pytest.mark.parametrize(("cells", "said"), [(("1.5", "2.5"), True), (("1", "2"), False), (("base", "soft"), False)])
+def test_a_second_column_of_names_that_holds_numbers_is_said(
+    tmp_path: Path, cells: tuple[str, str], said: bool
+) -> None:
+    (tmp_path / "runs.csv").write_text(f"run,sim,angle\nrun_01,{cells[0]},15\nrun_02,{cells[1]},20\n")
+    notes = read_parameter_table(tmp_path / "runs.csv").notes
+    assert [
+        note.endswith("column 'sim' is taken for another name of the runs and is no parameter") for note in notes
+    ] == ([True] if said else [])

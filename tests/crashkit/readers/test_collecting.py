@@ -35,7 +35,7 @@ def states(folder: Path, move: float, stem: str = "out", count: int = 3, **time:
     return files
 
 
-def pvd(path: Path, entries: list[tuple[float, str, str]]) -> Path:
+def pvd(path: Path, entries: list[tuple[float | str, str, str]]) -> Path:
     rows = "".join(f'<DataSet timestep="{t}" {part} file="{file}"/>' for t, part, file in entries)
     path.write_text(f'<?xml version="1.0"?><VTKFile type="Collection"><Collection>{rows}</Collection></VTKFile>')
     return path
@@ -109,6 +109,13 @@ def test_states_listed_twice_are_one_state_and_said(tmp_path, part, first):
     assert float(run.displacement(2, 3).max()) == 10
     assert f"{3 - first} state" in run.notes[0]
     assert "listed more than once" in run.notes[0]
+
+
+def test_times_of_a_list_may_have_a_decimal_comma(tmp_path):
+    files = states(tmp_path, 1)
+    path = pvd(tmp_path / "run.pvd", [(f"0,{k}", "", f.name) for k, f in enumerate(files)])
+    (run,) = reader_for(path).runs(path)
+    assert run.time.tolist() == [0.0, 0.1, 0.2]
 
 
 def test_the_same_file_listed_twice_is_one_state(tmp_path):
@@ -280,6 +287,9 @@ def test_what_another_reader_would_find_is_said(tmp_path, data):
         ("s.vti", b'<VTKFile type="ImageData"/>', "is a VTK file of type ImageData"),
         ("s.nc", b"CDF\x01" + bytes(60), "is a classic NetCDF file and no Exodus file"),
         ("s.odb", b"?", "is an Abaqus output database"),
+        ("runs.zip", b"PK\x03\x04" + bytes(30), "is packed with ZIP; unpack it first"),
+        ("d3plot.gz", b"\x1f\x8b\x08" + bytes(30), "is packed with gzip; unpack it first"),
+        ("runs.tar", bytes(257) + b"ustar", "is packed with tar; unpack it first"),
         ("main.k", b"*KEYWORD", "is an LS-DYNA deck"),
     ],
 )  # fmt: skip
