@@ -13,7 +13,9 @@ from torch import Tensor
 from data_schema.levels import lift
 from surrogates.data.campaign import Labels
 from surrogates.data.graphs import Graphs
+from surrogates.data.inputs import over_range
 from surrogates.errors import SurrogateError
+from surrogates.local_errors import HARD, LocalErrors
 from surrogates.models.base import Network
 from surrogates.models.pod_regression import PodRegression
 from surrogates.operators.convolutions import exportable
@@ -187,7 +189,60 @@ class Surrogate:
         """What the model says of runs (run, parameter) before they are computed: their size, and its own deviation."""
         core = self.core
         said = core.deviation(self.registration.read(parameters)) if isinstance(core, PodRegression) else None
-        return Beliefs(self.registration.clock.size(parameters), np.ones(len(parameters)) if said is None else said)
+        deviation = np.ones(len(parameters)) if said is None else said
+        return Beliefs(self.registration.clock.size(parameters), deviation, *self.places(parameters))
+
+    def places(self, parameters: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+        """Where runs (run, parameter) lie in the trained range, in [-1, 1], and where their mirror images do."""
+        ranges, symmetry = self.record.ranges, self.registration.symmetry
+        corners = np.stack([ranges.low, ranges.high])
+        images = None if symmetry.is_identity else over_range(symmetry.images(parameters, ranges.names), corners)
+        return over_range(parameters, corners), images
+
+    def local_errors(self) -> LocalErrors | None:
+        """Where left-out runs were predicted worse than the model expected; None where too few runs say it."""
+        record = self.record
+        if not record.left_out or len(record.parameters) != len(record.ranges.names):
+            return None
+        places = [record.fitted_runs.index(name) for name in record.left_out]
+        runs = np.array([record.parameters[n] for n in record.ranges.names], np.float64).T[places]
+        errors, deviations = np.array(list(record.left_out.values()), np.float64).T
+        beliefs = Beliefs(self.registration.clock.size(runs), deviations, *self.places(runs))
+        return beliefs.local(errors, np.arange(len(runs)))
+
+    def hard_runs(self) -> dict[str, tuple[float, float]]:
+        """Runs at places where others, too, were predicted badly when left out: e2, m, and times the typical error."""
+        local = self.local_errors()
+        if local is None:
+            return {}
+        around = local.at(local.points, local.run)
+        out = {}
+        for place in np.argsort(-local.ratio, kind="stable"):
+            name = tuple(self.record.left_out)[int(local.run[place])]
+            if min(local.ratio[place], around[place]) >= HARD and name not in out:
+                out[name] = (self.record.left_out[name][0], float(local.ratio[place]))
+        return out
+
+    def hard(self, parameters: ArrayLike) -> list[str]:
+        """One sentence for each place where runs near the queries (query, parameter) were predicted badly without them."""
+        local = self.local_errors()
+        if local is None:
+            return []
+        values, _ = self.checked(parameters, None)
+        points, _ = self.places(values)
+        names = np.array(list(self.record.left_out))
+        out: dict[str, float] = {}
+        for point, times in zip(points, local.at(points), strict=True):
+            found = local.hard_runs(point)
+            if times >= HARD and len(found):
+                named = [(name, self.record.left_out[name][0]) for name in names[found[:3]]]
+                said = ", ".join(f"{name} ({100 * error:.2g} cm)" for name, error in named)
+                out[said] = max(times, out.get(said, 0.0))
+        return [
+            f"near a fold: the model was wrong about {said} when left out; expect {times:.1f} times the typical error here, "
+            "or compute a run"
+            for said, times in out.items()
+        ]
 
     def sensitivity(
         self,

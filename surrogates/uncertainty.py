@@ -7,8 +7,9 @@ between true and predicted node is divided by a scale, a product of one number f
 for the run, the first two estimated on the other runs; the band is the scale times the quantile of these ratios, all
 runs pooled (Dunn, Wasserman, Ramdas 2022, doi 10.1080/01621459.2022.2060112, "pooling CDFs": the nominal share of nodes
 and states of a new run lies inside, on average, as the number of runs grows). The number for the run is what the model
-itself says of a query before it is computed: its size against the reference's, and what the process believes its own
-error to be. The belief enters with its root: whole, it makes the band too narrow for fast runs.
+itself says of a query before it is computed: its size against the reference's, what the process believes its own
+error to be, and how wrong the model was about runs near the query when they were left out (`surrogates.local_errors`).
+The belief enters with its root: whole, it makes the band too narrow for fast runs.
 """
 
 from __future__ import annotations
@@ -21,11 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogates.errors import SurrogateError
+from surrogates.local_errors import LocalErrors
 
 # Fewer validation runs than this leave no other run to estimate the scale on.
 FEWEST_RUNS = 2
 # Fewer training runs than this give no band by cross-validation: a tenth of them is less than one run.
 FEWEST_BY_FOLDS = 8
+# Fewer runs than this lie too far apart to say anything of their neighbours.
+FEWEST_LOCAL = 16
 # Shares for which the ratios' quantiles are kept; between them they are interpolated.
 SHARES = np.round(np.arange(0.50, 0.995, 0.01), 2)
 # Nodes whose ratios are pooled; more change no quantile.
@@ -33,24 +37,53 @@ _POOLED = 2000
 # The share by which kinds of spread are compared.
 _COMPARED = 0.9
 
-Spread = Literal["constant", "size", "deviation"]
+Spread = Literal["constant", "size", "deviation", "local"]
 # Means (run, node) and (run, state), and the distances (state, some nodes) of each run.
 Gathered = tuple[NDArray[np.float64], NDArray[np.float64], list[NDArray[np.float32]]]
-_SPREADS: tuple[Spread, ...] = ("constant", "size", "deviation")
+_SPREADS: tuple[Spread, ...] = ("constant", "size", "deviation", "local")
 
 
 @dataclass(frozen=True)
 class Beliefs:
-    """What a model says of runs before they are computed: sizes (run,), and deviations (run,) up to a factor."""
+    """What a model says of runs before they are computed.
+
+    Attributes
+    ----------
+    size, deviation
+        (run,) up to a factor.
+    points, images
+        Where the runs and their mirror images lie: (run, parameter) in [-1, 1] over the trained range; None where that
+        says nothing.
+    """
 
     size: NDArray[np.float64]
     deviation: NDArray[np.float64]
+    points: NDArray[np.float64] | None = None
+    images: NDArray[np.float64] | None = None
 
-    def spread(self, kind: Spread) -> NDArray[np.float64]:
-        """(run,): how wide the band of each run is, up to a factor."""
+    def spread(
+        self, kind: Spread, local: LocalErrors | None = None, runs: NDArray[np.int64] | None = None
+    ) -> NDArray[np.float64]:
+        """(run,): how wide the band of each run is, up to a factor.
+
+        local  of the kind "local"; runs: which run each is of, where they are those behind `local`
+        """
         if kind == "constant":
             return np.ones(len(self.size))
-        return self.size if kind == "size" else self.size * np.sqrt(self.deviation)
+        if kind == "size":
+            return self.size
+        expected = self.size * np.sqrt(self.deviation)
+        if kind == "local":
+            if local is None or self.points is None:
+                raise SurrogateError("a band that follows local errors needs them, and the place of the run")
+            return expected * local.at(self.points, runs)
+        return expected
+
+    def local(self, errors: NDArray[np.float64], runs: NDArray[np.int64]) -> LocalErrors | None:
+        """Where these runs were predicted worse than expected, from errors (run,), m; None for too few runs."""
+        if self.points is None or not self.points.shape[1] or len(np.unique(runs)) < FEWEST_LOCAL:
+            return None
+        return LocalErrors.of(self.points, errors / self.spread("deviation"), runs, self.images)
 
 
 @dataclass(frozen=True)
@@ -66,7 +99,10 @@ class Band:
     runs
         Runs behind it.
     spread, unit
-        What the width of a run follows: nothing, its size, or size and deviation; and the value for which `run` is 1.
+        What the width of a run follows: nothing, its size, size and deviation, or these and the errors of runs near
+        it; and the value for which `run` is 1.
+    local
+        Errors of left-out runs, of the kind "local".
     """
 
     node: NDArray[np.float32]
@@ -76,6 +112,7 @@ class Band:
     runs: int
     spread: Spread = "constant"
     unit: float = 1.0
+    local: LocalErrors | None = None
 
     def half_width(
         self, coverage: float, time: NDArray[np.float64], beliefs: Beliefs | None = None
@@ -93,7 +130,7 @@ class Band:
             raise SurrogateError(f"coverage {coverage} was asked for; expected {SHARES[0]:g} to {SHARES[-1]:g}")
         factor = np.interp(coverage, SHARES, self.factor)
         if beliefs is not None:
-            factor = factor * float(beliefs.spread(self.spread)[0]) / self.unit
+            factor = factor * float(beliefs.spread(self.spread, self.local)[0]) / self.unit
         state = np.interp(time, self.time, self.state)
         return (factor * state[:, None] * self.node[None]).astype(np.float32)
 
@@ -124,15 +161,17 @@ def calibrate_gathered(
     which = np.arange(count) if runs is None else runs
     if len(np.unique(which)) < FEWEST_RUNS:
         raise SurrogateError(f"a band needs at least {FEWEST_RUNS} validation runs; found {len(np.unique(which))}")
+    local = None if beliefs is None else beliefs.local(np.nanmean(by_state, axis=1), which)
+    kinds = _SPREADS[:1] if beliefs is None else _SPREADS if local is not None else _SPREADS[:-1]
     found = []
-    for kind in _SPREADS[:1] if beliefs is None else _SPREADS:
-        spread = np.ones(count) if beliefs is None else beliefs.spread(kind)
+    for kind in kinds:
+        spread = np.ones(count) if beliefs is None else beliefs.spread(kind, local, which)
         unit = float(np.sqrt(np.square(spread).mean()))
         share = spread / unit
         node, state, factor = _product(by_node / share[:, None], by_state / share[:, None], pooled, share, which)
         band = Band(
             node.astype(np.float32), state.astype(np.float32), np.asarray(time, np.float64), factor,
-            len(np.unique(which)), kind, unit,
+            len(np.unique(which)), kind, unit, local if kind == "local" else None,
         )  # fmt: skip
         width = np.interp(_COMPARED, SHARES, factor) * float(node.mean() * state.mean() * share.mean())
         found.append((width, band))

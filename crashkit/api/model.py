@@ -103,7 +103,8 @@ class Model:
             `displacement` (time, node, xyz), m, with `sim` in front for several runs; the parameters; and the mesh, so
             that `prediction.crash.to_pyvista(time=0.02).plot()` draws it. The coordinate `node` says which node of
             the full mesh each one is. Attributes: `model`, `level`, and `warnings`: what lies outside the trained
-            range, of which there is a Python warning, too.
+            range or near a fold, where neighbouring runs differ by more than their distance explains. Each is a Python
+            warning, too.
 
         Raises
         ------
@@ -138,7 +139,8 @@ class Model:
         u = surrogate.predict_full(values, at, number) if full else surrogate.predict(values, at, number)
         if not np.isfinite(u).all():
             raise DataError("the model gives numbers that are not finite for these parameters; train it again")
-        for sentence in outside:
+        unsure = [*outside, *surrogate.hard(values)]
+        for sentence in unsure:
             warnings.warn(sentence, stacklevel=2)
         arrays: dict[str, tuple[NDArray[Any], str]] = {"displacement": (u, "m")}
         if band is not None:
@@ -171,7 +173,7 @@ class Model:
             attrs={
                 "model": next(name for name, k in self.levels.items() if k == number),
                 "level": 0 if full else number,
-                "warnings": "; ".join(outside),
+                "warnings": "; ".join(unsure),
             },
         )
         if not several:

@@ -64,7 +64,7 @@ def card(surrogate: Surrogate) -> str:
         ]
     else:
         lines.append("None were held out, so there is no independent error here.")
-    lines += ["", *_bands(surrogate)]
+    lines += ["", *_bands(surrogate), *_hard(surrogate)]
     lines += ["", "## Data", "", f"- dataset checksum (SHA-256): `{record.checksum or 'not recorded'}`"]
     lines += [f"- {_plain(key)}: {_plain(value)}" for key, value in record.attributes.items()]
     lines += [
@@ -132,6 +132,31 @@ def _bands(surrogate: Surrogate) -> list[str]:
         "the model itself knows less (`half_width` of `crashkit predict --band`). Of a typical run:",
         "",
         *_table(("prediction", "mean half-width (cm)", "runs"), rows),
+    ]
+
+
+def _hard(surrogate: Surrogate) -> list[str]:
+    """Where neighbouring training runs differ by more than their distance explains."""
+    found = surrogate.hard_runs()
+    if not found:
+        return []
+    record = surrogate.record
+    names = record.ranges.names
+    rows = []
+    for run, (error, times) in found.items():
+        place = record.fitted_runs.index(run)
+        values = (f"{record.parameters[name][place]:.4g}" for name in names)
+        rows.append((run, *values, f"{100 * error:.2f}", f"{times:.1f}"))
+    units = (f"{name} ({unit})" for name, unit in zip(names, record.ranges.units, strict=True))
+    return [
+        "",
+        "## Near a fold",
+        "",
+        "Runs that were predicted far worse than the model expected when they were left out, and so were others near them:",
+        "there the structure goes one way or another, and neighbouring runs differ by more than their distance explains.",
+        "Queries near them get a wider band and a warning. Look at these runs in ParaView; compute further runs there.",
+        "",
+        *_table(("run", *units, "error left out (cm)", "times the typical"), rows),
     ]
 
 

@@ -121,6 +121,11 @@ def check_bands(bands: Mapping[tuple[int, bool], Band], graphs: Graphs, record: 
         name = f"band of level {level}"
         numbers(f"node of the {name}", band.node, (graphs.n_nodes(0 if full else level),))
         numbers(f"state of the {name}", band.state, (len(record.time),))
+        if band.local is not None:
+            places = len(band.local.ratio)
+            numbers(f"points of the {name}", band.local.points, (places, None))
+            numbers(f"ratio of the {name}", band.local.ratio, (places,))
+            numbers(f"run of the {name}", band.local.run, (places,))
 
 
 def check_core(core: Network | PodRegression, graphs: Graphs) -> None:

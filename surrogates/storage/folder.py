@@ -32,6 +32,7 @@ from surrogates.data.campaign import Labels
 from surrogates.data.graphs import Graphs
 from surrogates.data.inputs import InputScaling
 from surrogates.errors import ModelFolderError, SurrogateError
+from surrogates.local_errors import LocalErrors
 from surrogates.models.base import Network, take_over
 from surrogates.models.cascade import Cascade, build_level
 from surrogates.models.pod_regression import PodRegression
@@ -46,7 +47,7 @@ from surrogates.uncertainty import Band, Spread
 
 FORMAT = 2
 _MAIN = "model.json"
-_SPREADS: tuple[Spread, ...] = ("constant", "size", "deviation")
+_SPREADS: tuple[Spread, ...] = ("constant", "size", "deviation", "local")
 _LABELS = ("node_id", "face_part", "part_id", "face_id")
 
 
@@ -261,7 +262,10 @@ def _labels(tensors: Mapping[str, Tensor], about: Mapping[str, Any]) -> Labels |
 def _band_tensors(surrogate: Surrogate) -> dict[str, Tensor]:
     out: dict[str, Tensor] = {}
     for (number, lifted), band in surrogate.bands.items():
-        arrays = {"node": band.node, "state": band.state, "factor": band.factor}
+        arrays: dict[str, NDArray[Any]] = {"node": band.node, "state": band.state, "factor": band.factor}
+        if band.local is not None:
+            arrays |= {"points": band.local.points, "ratio": band.local.ratio, "run": band.local.run}
+            arrays["width"] = np.array([band.local.width])
         prefix = f"{number}.{'full' if lifted else 'own'}."
         out |= {prefix + k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in arrays.items()}
         out[prefix + "runs"] = torch.tensor([band.runs])
@@ -279,7 +283,13 @@ def _bands(tensors: Mapping[str, Tensor], record: Record) -> dict[tuple[int, boo
             spread = _SPREADS[int(tensors[f"{number}.{where}.spread"][0])]
             unit = float(tensors[f"{number}.{where}.unit"][0])
             runs = int(tensors[key][0])
-            out[int(number), where == "full"] = Band(**parts, time=record.time, runs=runs, spread=spread, unit=unit)
+            local = None
+            if spread == "local":
+                a = {n: tensors[f"{number}.{where}.{n}"].numpy() for n in ("points", "ratio", "run", "width")}
+                local = LocalErrors(a["points"], a["ratio"], a["run"], float(a["width"][0]))
+            out[int(number), where == "full"] = Band(
+                **parts, time=record.time, runs=runs, spread=spread, unit=unit, local=local
+            )
     return out
 
 

@@ -153,10 +153,10 @@ def _judge_by_folds(surrogate: Surrogate, trainer: Trainer, found: PodFit) -> No
             f"there is no band: it takes {FEWEST_BY_FOLDS} training runs, and there are {len(set(places))}"
         )
         return
-    sizes = found.registration.clock.size(trainer.campaign.parameters[runs[places]])
-    surrogate.bands[0, False] = calibrate_gathered(
-        gathered, record.time, Beliefs(sizes, np.array(deviations)), np.array(places)
-    )
+    parameters = trainer.campaign.parameters[runs[places]]
+    sizes = found.registration.clock.size(parameters)
+    beliefs = Beliefs(sizes, np.array(deviations), *surrogate.places(parameters))
+    surrogate.bands[0, False] = calibrate_gathered(gathered, record.time, beliefs, np.array(places))
 
 
 def _fit_unified(surrogate: Surrogate, trainer: Trainer) -> None:
@@ -288,8 +288,10 @@ def _note(
         kind = "training" if by_folds else "validation"
         trainer.notes.add(f"there is no band: it takes {fewest} {kind} runs, and there are {len(places)}")
         return
-    sizes = surrogate.registration.clock.size(campaign.parameters[places])
-    surrogate.bands[band] = calibrate_gathered(gathered, record.time, Beliefs(sizes, np.ones(len(places))))
+    parameters = campaign.parameters[places]
+    sizes = surrogate.registration.clock.size(parameters)
+    beliefs = Beliefs(sizes, np.ones(len(places)), *surrogate.places(parameters))
+    surrogate.bands[band] = calibrate_gathered(gathered, record.time, beliefs)
 
 
 def _full_field(trainer: Trainer) -> LevelRuns | None:
