@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crashkit.mesh._compiled import compiled
+from data_schema.compiled import compiled
 
 
 @compiled

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.mesh._closest import closest_weights
-from crashkit.mesh._compiled import compiled
+from data_schema.compiled import compiled
 
 
 class Coarse(NamedTuple):

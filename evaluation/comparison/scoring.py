@@ -20,7 +20,8 @@ from evaluation.comparison.sensors import Parted, Sensors, Watched, joined, part
 from evaluation.errors import EvaluationError
 from evaluation.measures.distance import Peak, masked_mean, mean_node_error, node_distance
 from evaluation.measures.projection import last_seen, projection_error
-from evaluation.measures.tally import Groups, Tally, state_blocks
+from evaluation.measures.rigid import RigidMotion, fit_both, fit_rigid
+from evaluation.measures.tally import Gathering, Groups, Tally, state_blocks
 
 Key = tuple[int, int]  # number of the model, number of its predictor
 
@@ -134,11 +135,12 @@ def score_run(
             f"run {reference.runs[run]} has no displacement that is a number, so there is no reference to compare "
             f"with; leave it out of the test runs or ingest it again"
         )
-    groups = {**(groups or {}), _LEVELS: _level_nodes(reference)}
+    gathering = Gathering.of({**(groups or {}), _LEVELS: _level_nodes(reference)}, reference.n_nodes)
+    motion = fit_rigid(reference.position_of(run), truth) if reference.n_nodes > 2 else None
     scores: dict[Key, RunScore] = {}
     for key, predictor in predictors.items():
         try:
-            scores[key] = _score(reference, predictor, run, truth, groups, sensors)
+            scores[key] = _score(reference, predictor, run, truth, motion, gathering, sensors)
         except EvaluationError as error:
             raise EvaluationError(f"{predictor.name} on run {reference.runs[run]}: {error}") from error
     floor = {
@@ -148,12 +150,14 @@ def score_run(
     return RunScores(
         run,
         scores,
-        *_sizes(reference, truth, groups),
+        *_sizes(reference, truth, gathering),
         floor,
         _lifting(reference, truth),
         None
         if sensors is None
-        else joined([watch(reference, sensors, run, truth[s]) for s in state_blocks(*truth.shape[:2])]),
+        else joined(
+            [watch(reference, sensors, run, truth[s], _part(motion, s)) for s in state_blocks(*truth.shape[:2])]
+        ),
     )
 
 
@@ -169,23 +173,28 @@ def _score(
     predictor: Predictor,
     run: int,
     truth: NDArray[np.float32],
-    groups: Groups,
+    motion: RigidMotion | None,
+    gathering: Gathering,
     sensors: Sensors | None,
 ) -> RunScore:
     mesh = mesh_of(reference, predictor)
     # A reduction is asked about whole states; what is gone there stays where it was.
     own = last_seen(truth) if mesh is None else last_seen(truth[:, mesh.kept])
-    asked, again = Tally(groups, reference.n_nodes), Tally({_LEVELS: groups[_LEVELS]}, reference.n_nodes)
-    parted, watched, within = [], [], []
+    asked = Tally(gathering, reference.n_nodes)
+    again = Tally(gathering.only(_LEVELS), reference.n_nodes, brief=True)
+    parted, watched, within = [], [], np.zeros(2, np.int64)
+    position = reference.position_of(run)
     for states in state_blocks(*truth.shape[:2]):
         count = states.stop - states.start
         field = predictor.predict(reference.parameters[run], reference.time[states])
         prediction = full_field(reference, predictor, field, count)
-        asked.add(truth[states], prediction)
-        within.append(_within(predictor, reference.parameters[run], reference.time[states], truth[states], prediction))
-        parted.append(part_error(reference, run, truth[states], prediction))
+        distance = asked.add(truth[states], prediction)
+        within += _within(predictor, reference.parameters[run], reference.time[states], distance)
+        motions = fit_both(position, truth[states], prediction, _part(motion, states))
+        parted.append(part_error(reference, run, truth[states], prediction, motions))
         if sensors is not None:
-            watched.append(watch(reference, sensors, run, prediction))
+            whole = len(distance) > 0 and not bool(np.isnan(distance.sum()))
+            watched.append(watch(reference, sensors, run, prediction, motions[1] if whole else None))
         again.add(truth[states], full_field(reference, predictor, predictor.reconstruct(own[states]), count))
     return RunScore(
         e2=asked.over_time("e2"),
@@ -198,40 +207,39 @@ def _score(
         peak=asked.peak,
         node_sum=asked.node_sum,
         node_count=asked.node_count,
-        groups={name: asked.of_groups(name) for name in groups if name != _LEVELS},
+        groups={name: asked.of_groups(name) for name in gathering.groups if name != _LEVELS},
         parted=joined(parted),
         watched=joined(watched) if watched else None,
-        covered=_share(np.concatenate(within)),
+        covered=within[0] / within[1] if within[1] else float("nan"),
     )
+
+
+def _part(motion: RigidMotion | None, states: slice) -> RigidMotion | None:
+    """The motion of some states."""
+    return None if motion is None else RigidMotion(motion.rotation[states], motion.translation[states], motion.centre)
 
 
 def _within(
     predictor: Predictor,
     parameters: NDArray[np.float64],
     time: NDArray[np.float64],
-    truth: NDArray[np.float32],
-    prediction: NDArray[np.float32],
-) -> NDArray[np.bool_]:
-    """(n,) whether each node and state that is there lies within the predictor's band; empty where it gives none."""
+    distance: NDArray[np.float64],
+) -> NDArray[np.int64]:
+    """(2,): how many nodes and states lie within the predictor's band, and how many are there; zeros where it gives none."""
     width = predictor.half_width(NOMINAL, time, parameters) if isinstance(predictor, Banded) else None
     if width is None:
-        return np.zeros(0, bool)
-    distance = node_distance(truth, prediction)
-    return (distance <= width)[np.isfinite(distance)]
-
-
-def _share(within: NDArray[np.bool_]) -> float:
-    return float(within.mean()) if len(within) else float("nan")
+        return np.zeros(2, np.int64)
+    return np.array([np.count_nonzero(distance <= width), np.count_nonzero(np.isfinite(distance))])
 
 
 def _sizes(
-    reference: Reference, truth: NDArray[np.float32], groups: Groups
+    reference: Reference, truth: NDArray[np.float32], gathering: Gathering
 ) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
     """Mean displacement (state,) of all nodes, and over time of each group (group,), m."""
-    still = Tally(groups, reference.n_nodes)
+    still = Tally(gathering, reference.n_nodes, brief=True)
     for states in state_blocks(*truth.shape[:2]):
         still.add(truth[states], np.zeros_like(truth[states]))
-    return still.over_time("e2"), {name: still.of_groups(name) for name in groups if name != _LEVELS}
+    return still.over_time("e2"), {name: still.of_groups(name) for name in gathering.groups if name != _LEVELS}
 
 
 def _lifting(reference: Reference, truth: NDArray[np.float32]) -> dict[int, NDArray[np.float64]]:
@@ -267,7 +275,7 @@ def full_field(
             f"evaluate it with the dataset it was trained on"
         )
     own = np.asarray(field, dtype=np.float32)
-    return own if mesh is None else np.ascontiguousarray(lift(mesh.to_full, own))
+    return own if mesh is None else np.asarray(lift(mesh.to_full, own))
 
 
 def mesh_of(reference: Reference, predictor: Predictor) -> Level | None:

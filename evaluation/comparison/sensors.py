@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from evaluation.comparison.reference import Reference
 from evaluation.errors import EvaluationError
 from evaluation.measures.probes import intrusion
-from evaluation.measures.rigid import split_error
+from evaluation.measures.rigid import RigidMotion, fit_both, split_by_motions
 
 AXES = {"x": 0, "y": 1, "z": 2}
 N_PROBES = 4
@@ -106,19 +106,44 @@ def choose_sensors(
     return Sensors(chosen, everything, direction, everything, about)
 
 
-def watch(reference: Reference, sensors: Sensors, run: int, field: NDArray[np.floating]) -> Watched:
-    """What `sensors` see of `field` (state, node, 3), m, some states of run number `run`."""
-    if np.isfinite(field[:, sensors.intruding]).any():
+def watch(
+    reference: Reference, sensors: Sensors, run: int, field: NDArray[np.floating], motion: RigidMotion | None = None
+) -> Watched:
+    """What `sensors` see of `field` (state, node, 3), m, some states of run number `run`.
+
+    Parameters
+    ----------
+    motion
+        The rigid motion of all nodes of `field`, where it is known.
+    """
+    intruding = sensors.intruding
+    if np.isfinite(field[:, intruding[0]]).any() or np.isfinite(field[:, intruding]).any():
         position = reference.position_of(run)
-        seen = intrusion(position, field, sensors.intruding, sensors.direction, sensors.watching).history
+        whole = sensors.watching is not None and len(sensors.watching) == reference.n_nodes
+        known = motion if whole else None
+        seen = intrusion(position, field, intruding, sensors.direction, sensors.watching, known).history
     else:
         seen = np.full(len(field), np.nan)
     return Watched(field[:, sensors.probes].astype(np.float64), seen)
 
 
-def part_error(reference: Reference, run: int, truth: NDArray[np.floating], prediction: NDArray[np.floating]) -> Parted:
-    """Errors of `prediction` (state, node, 3) by kind, for some states of run number `run`."""
-    split = split_error(reference.position_of(run), truth, prediction)
+def part_error(
+    reference: Reference,
+    run: int,
+    truth: NDArray[np.floating],
+    prediction: NDArray[np.floating],
+    motions: tuple[RigidMotion, RigidMotion] | None = None,
+) -> Parted:
+    """Errors of `prediction` (state, node, 3) by kind, for some states of run number `run`.
+
+    Parameters
+    ----------
+    motions
+        The rigid motions of truth and prediction over the nodes that are there, where they are known.
+    """
+    position = reference.position_of(run)
+    true, predicted = motions or fit_both(position, truth, prediction)
+    split = split_by_motions(position, truth, prediction, true, predicted)
     return Parted(split.rigid, split.deformation, split.true_rigid, split.true_deformation)
 
 

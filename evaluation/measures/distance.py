@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.errors import EvaluationError
+from evaluation.measures.passes import distances
 
 
 def node_distance(truth: NDArray[np.floating], prediction: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -26,22 +27,24 @@ def node_distance(truth: NDArray[np.floating], prediction: NDArray[np.floating])
     EvaluationError
         Where the shapes differ or the prediction is not finite at a node that is there.
     """
+    return compared(truth, prediction)[0]
+
+
+def compared(truth: NDArray[np.floating], prediction: NDArray[np.floating]) -> tuple[NDArray[np.float64], float, float]:
+    """`node_distance`, and the sums of squares of distance and of displacement over the nodes that are there."""
     if truth.shape != prediction.shape or truth.ndim != 3 or truth.shape[-1] != 3:
         raise EvaluationError(
             f"truth has shape {truth.shape} and the prediction {prediction.shape}; expected the same (state, node, 3)"
         )
-    squares = np.zeros(truth.shape[:2])
-    for axis in range(3):  # one direction at a time: no float64 copy of the whole field
-        squares += np.square(truth[..., axis].astype(np.float64) - prediction[..., axis])
-    bad = ~np.isfinite(squares) & ~gone(truth)
-    if bad.any():
-        state, node = np.argwhere(bad)[0]
+    out = np.empty(truth.shape[:2])
+    wrong, size, bad = distances(truth, prediction, out)
+    if bad:
+        state, node = np.argwhere(~np.isfinite(out) & ~gone(truth))[0]
         raise EvaluationError(
-            f"the prediction is not finite in state {state} at node {node} ({int(bad.sum())} such values), where the "
+            f"the prediction is not finite in state {state} at node {node} ({bad} such values), where the "
             f"reference has a displacement; expected numbers wherever the node exists"
         )
-    squares[gone(truth)] = np.nan
-    return np.sqrt(squares)
+    return out, wrong, size
 
 
 def gone(truth: NDArray[np.floating]) -> NDArray[np.bool_]:

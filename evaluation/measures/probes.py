@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evaluation.errors import EvaluationError
-from evaluation.measures.rigid import fit_rigid
+from evaluation.measures.passes import furthest
+from evaluation.measures.rigid import RigidMotion, fit_rigid
 
 Floats = NDArray[np.float64]
 
@@ -154,6 +155,7 @@ def intrusion(
     nodes: ArrayLike,
     direction: ArrayLike,
     reference: ArrayLike | None = None,
+    motion: RigidMotion | None = None,
 ) -> Intrusion:
     """How far `nodes` of a part come in along `direction`, as seen from the `reference` nodes.
 
@@ -170,6 +172,8 @@ def intrusion(
     reference
         Numbers of at least three nodes off one line, such as the seat's cross member: the observer moves and turns
         with them (best fit, evaluation.measures.rigid). Without: measured from the ground.
+    motion
+        The rigid motion of the `reference` nodes, where it is known.
 
     Raises
     ------
@@ -178,7 +182,7 @@ def intrusion(
     """
     x, u = np.asarray(position, np.float64), np.asarray(displacement)
     inside = np.atleast_1d(np.asarray(nodes, np.int64))
-    towards = np.asarray(direction, np.float64)
+    towards = np.array(direction, np.float64)
     if towards.shape != (3,) or not np.isfinite(towards).all() or not towards.any():
         raise EvaluationError(f"direction {towards.tolist()}: expected three numbers that are not all zero")
     for name, numbers in (("nodes", inside), ("reference", np.asarray([] if reference is None else reference))):
@@ -186,23 +190,25 @@ def intrusion(
             numbers.size and not 0 <= numbers.min() <= numbers.max() < len(x)
         ):
             raise EvaluationError(f"{name} of an intrusion: expected numbers from 0 to {len(x) - 1}, at least one")
+    towards /= np.linalg.norm(towards)
     if reference is None:
-        seen = u[:, inside].astype(np.float64)
-    else:
+        count = len(u)
+        motion = RigidMotion(np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), np.zeros(3))
+    elif motion is None:
         watching = np.asarray(reference, np.int64)
         if len(watching) < 3 or np.linalg.matrix_rank(x[watching] - x[watching].mean(axis=0), tol=1e-9) < 2:
             raise EvaluationError(
                 f"{len(watching)} reference nodes on one line: expected at least three that are not, to see rotation"
             )
-        seen = fit_rigid(x, u, watching).deformation(x[inside], u[:, inside])
-    along = seen @ (towards / np.linalg.norm(towards))
-    if np.isnan(along).all():
+        motion = fit_rigid(x, u, watching)
+    history, where = np.empty(len(u)), np.empty(len(u), np.int64)
+    furthest(x - motion.centre, u, inside, motion.rotation, motion.translation, towards, history, where)
+    if np.isinf(history).all():
         raise EvaluationError("all nodes of the intrusion are gone in every state: expected some that are there")
-    furthest = np.where(np.isnan(along), -np.inf, along)
-    state, node = np.unravel_index(int(np.argmax(furthest)), along.shape)
-    history = furthest.max(axis=1)
+    state = int(np.argmax(history))
+    largest, node = float(history[state]), int(inside[where[state]])
     history[np.isinf(history)] = np.nan
-    return Intrusion(history, float(along[state, node]), int(state), int(inside[node]))
+    return Intrusion(history, largest, state, node)
 
 
 # --- ISO/TS 18571 ----------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evaluation.errors import EvaluationError
-from evaluation.measures.distance import masked_mean
+from evaluation.measures.passes import moments, parted
 
 Floats = NDArray[np.float64]
 
@@ -68,27 +68,36 @@ def fit_rigid(position: ArrayLike, displacement: ArrayLike, nodes: ArrayLike | N
         For arrays that do not fit or fewer than three nodes.
     """
     x, u = _checked(position, displacement)
-    if nodes is not None:
+    if nodes is not None and not _everything(np.asarray(nodes), len(x)):
         x, u = x[np.asarray(nodes)], u[:, np.asarray(nodes)]
+    return _fitted(x, u, u)
+
+
+def _everything(nodes: NDArray[np.integer], count: int) -> bool:
+    """Whether `nodes` are all `count` nodes in their order."""
+    return len(nodes) == count and np.array_equal(nodes, np.arange(count))
+
+
+def _fitted(x: Floats, u: NDArray[np.floating], there: NDArray[np.floating]) -> RigidMotion:
+    """The motion of the nodes that are finite in `u` and in `there`, both (t, n, 3)."""
     if len(x) < 3:
         raise EvaluationError(f"a rigid motion asked for of {len(x)} nodes: expected at least three")
     centre = x.mean(axis=0)
+    count = np.zeros(len(u), np.int64)
+    sums, products = np.zeros((len(u), 2, 3)), np.zeros((len(u), 3, 3))
+    moments(x - centre, u, there, count, sums, products)
     rotation = np.full((len(u), 3, 3), np.nan)
     translation = np.full((len(u), 3), np.nan)
-    for k, state in enumerate(u):
-        there = np.isfinite(state).all(axis=1)
-        if there.sum() < 3:
-            continue
-        before, after = x[there], x[there] + state[there].astype(np.float64)
-        middle, moved = before.mean(axis=0), after.mean(axis=0)
-        rotation[k] = _rotation(before - middle, after - moved)
-        translation[k] = moved - centre - rotation[k] @ (middle - centre)
+    for k in np.flatnonzero(count >= 3):
+        middle, moved = sums[k] / count[k]
+        rotation[k] = _rotation(products[k] - count[k] * np.outer(moved, middle))
+        translation[k] = moved - rotation[k] @ middle
     return RigidMotion(rotation, translation, centre)
 
 
-def _rotation(before: Floats, after: Floats) -> Floats:
-    """The proper rotation R (3, 3) with the least sum of squares of after - R before."""
-    left, _, right = np.linalg.svd(after.T @ before)
+def _rotation(products: Floats) -> Floats:
+    """The proper rotation R (3, 3) with the least sum of squares of y - R x, from the sum of y x^T about the centroids."""
+    left, _, right = np.linalg.svd(products)
     sign = np.array([1.0, 1.0, np.linalg.det(left) * np.linalg.det(right)])
     return np.asarray((left * np.sign(sign)) @ right)
 
@@ -145,28 +154,59 @@ def split_error(
     _, p = _checked(position, prediction)
     if u.shape != p.shape:
         raise EvaluationError(f"truth has shape {u.shape} and the prediction {p.shape}: expected the same (t, n, 3)")
-    there = np.isfinite(u).all(axis=-1)
-    bad = there & ~np.isfinite(p).all(axis=-1)
-    if bad.any():
+    if nodes is None or _everything(np.asarray(nodes), len(x)):
+        true, predicted = _fitted(x, u, u), _fitted(x, p, u)
+    else:
+        some = np.asarray(nodes)
+        true, predicted = _fitted(x[some], u[:, some], u[:, some]), _fitted(x[some], p[:, some], u[:, some])
+    return split_by_motions(x, u, p, true, predicted)
+
+
+def fit_both(
+    position: ArrayLike, truth: ArrayLike, prediction: ArrayLike, true: RigidMotion | None = None
+) -> tuple[RigidMotion, RigidMotion]:
+    """The rigid motions of `truth` and of `prediction` (t, n, 3), m, over the nodes that are there in the truth.
+
+    Parameters
+    ----------
+    true
+        That of the truth, where it is known.
+    """
+    x, u = _checked(position, truth)
+    return true or _fitted(x, u, u), _fitted(x, np.asarray(prediction), u)
+
+
+def split_by_motions(
+    position: ArrayLike, truth: ArrayLike, prediction: ArrayLike, true: RigidMotion, predicted: RigidMotion
+) -> SplitError:
+    """`split_error` by rigid motions that are known, both about the same centre.
+
+    Raises
+    ------
+    EvaluationError
+        Where the prediction is not finite at a node that is there.
+    """
+    x, u = _checked(position, truth)
+    p = np.asarray(prediction)
+    count, sums = np.zeros(len(u), np.int64), np.zeros((len(u), 5))
+    parted(
+        x - true.centre, u, p, true.rotation, true.translation, predicted.rotation, predicted.translation, count, sums
+    )
+    if not np.isfinite(sums[:, 2]).all():
+        bad = np.isfinite(u).all(axis=-1) & ~np.isfinite(p).all(axis=-1)
         state, node = np.argwhere(bad)[0]
         raise EvaluationError(f"the prediction is not finite in state {state} at node {node}: expected numbers there")
-    p = np.where(there[..., None], p, np.nan)
-    true, predicted = fit_rigid(x, u, nodes), fit_rigid(x, p, nodes)
-    rigid_true = np.where(there[..., None], true.displacement(x), np.nan)
-    deformation_true = true.deformation(x, u)
+    mean = np.divide(sums, count[:, None], out=np.full_like(sums, np.nan), where=count[:, None] > 0)
+    rigid, deformation, total, true_rigid, true_deformation = mean.T
     return SplitError(
         translation=np.linalg.norm(predicted.translation - true.translation, axis=-1),
         rotation=_angle(np.einsum("tij,tkj->tik", predicted.rotation, true.rotation)),
-        rigid=_mean_length(predicted.displacement(x) - rigid_true),
-        deformation=_mean_length(predicted.deformation(x, p) - deformation_true),
-        total=_mean_length(p - u),
-        true_rigid=_mean_length(rigid_true),
-        true_deformation=_mean_length(deformation_true),
+        rigid=rigid,
+        deformation=deformation,
+        total=total,
+        true_rigid=true_rigid,
+        true_deformation=true_deformation,
     )
-
-
-def _mean_length(field: NDArray[np.floating]) -> Floats:
-    return masked_mean(np.linalg.norm(field, axis=-1), axis=-1)
 
 
 def _angle(rotation: Floats) -> Floats:
