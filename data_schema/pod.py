@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 # Rows of the tall matrices handled at once: bounds what stands in float64 beside the basis.
-_BLOCK = 1 << 14
+_BLOCK = 1 << 13
 # Below these shares of the largest, squared and singular values hold rounding only: states are in single precision.
 _ROUNDING_SQUARED, _ROUNDING = 1e-13, 1e-6
 
@@ -55,7 +55,8 @@ class Pod:
 class StreamedPod:
     """Feed runs with `add`, then ask for the `result`.
 
-    Memory: `keep` fields in float32 and one run.
+    Some runs wait until they are worth the work of merging them, which goes over all that is kept. Memory: `keep`
+    fields in float32, half as many that wait, and one run.
 
     Parameters
     ----------
@@ -76,8 +77,10 @@ class StreamedPod:
             raise ValueError(f"{count} modes were asked for; expected at least 1")
         self.count = count
         self.keep = max(count, 2 * count + 16 if keep is None else keep)
-        self.defect = 0.0
-        self._factor: NDArray[np.float32] | None = None  # U S, (3 * node, <= keep)
+        self._defect = 0.0
+        self._factor: NDArray[np.float32] | None = None  # U S, (3 * node, <= keep): columns are orthogonal
+        self._energy: NDArray[np.float64] = np.empty(0)  # squares of S
+        self._waiting: list[NDArray[np.float32]] = []
 
     def add(self, run: NDArray[np.floating]) -> None:
         """One run (state, node, 3), m, finite.
@@ -87,18 +90,50 @@ class StreamedPod:
         ValueError
             For a run with other nodes than those before.
         """
-        new = np.ascontiguousarray(run, np.float32).reshape(len(run), -1).T
-        old = self._factor if self._factor is not None else np.empty((len(new), 0), np.float32)
-        if len(old) != len(new):
+        new = np.ascontiguousarray(run, np.float32).reshape(len(run), -1)
+        before = self._waiting[0].shape[1] if self._waiting else new.shape[1]
+        before = before if self._factor is None else len(self._factor)
+        if before != new.shape[1]:
             raise ValueError(
-                f"a run of {len(new) // 3} nodes follows runs of {len(old) // 3}; expected the same nodes in all"
+                f"a run of {new.shape[1] // 3} nodes follows runs of {before // 3}; expected the same nodes in all"
             )
-        gram = sum(pair.T @ pair for pair in _pairs(old, new))
+        if len(new):
+            self._waiting.append(new)
+        if sum(map(len, self._waiting)) >= self.keep / 2:
+            self._merge()
+
+    def _merge(self) -> None:
+        """Take what waits into what is kept."""
+        if not self._waiting:
+            return
+        waiting, self._waiting = self._waiting, []
+        length, count, known = waiting[0].shape[1], sum(map(len, waiting)), len(self._energy)
+        old = np.empty((length, 0), np.float32) if self._factor is None else self._factor
+        # What is kept is orthogonal, so only products with what is new have to be made.
+        gram = np.zeros((known + count, known + count))
+        for rows in _blocks(length):
+            new = np.concatenate([run[:, rows] for run in waiting]).astype(np.float64)
+            gram[known:, known:] += new @ new.T
+            if known:
+                gram[known:, :known] += new @ old[rows].astype(np.float64)
+        gram[:known, :known] = np.diag(self._energy)
+        gram[:known, known:] = gram[known:, :known].T
         energy, vectors = np.linalg.eigh(gram)
         energy, vectors = energy[::-1].clip(0), vectors[:, ::-1]
         kept = min(self.keep, max(1, int((energy > energy[0] * _ROUNDING_SQUARED).sum())))
-        self.defect += float(energy[kept]) if kept < len(energy) else 0.0
-        self._factor = np.concatenate([(pair @ vectors[:, :kept]).astype(np.float32) for pair in _pairs(old, new)])
+        self._defect += float(energy[kept]) if kept < len(energy) else 0.0
+        turn, mix = vectors[:known, :kept], vectors[known:, :kept]
+        factor = old if kept == known else np.empty((length, kept), np.float32)
+        for rows in _blocks(length):
+            out = np.concatenate([run[:, rows] for run in waiting]).astype(np.float64).T @ mix
+            factor[rows] = out + old[rows].astype(np.float64) @ turn if known else out
+        self._factor, self._energy = factor, energy[:kept]
+
+    @property
+    def defect(self) -> float:
+        """m^2: how far each squared singular value lies below the exact one, at most."""
+        self._merge()
+        return self._defect
 
     def result(self) -> Pod:
         """The decomposition of everything added.
@@ -108,26 +143,35 @@ class StreamedPod:
         ValueError
             Where nothing was.
         """
+        self._merge()
         if self._factor is None:
             raise ValueError("no runs to decompose; expected at least one")
         factor = self._factor[:, : self.count]
-        values = np.sqrt(np.square(factor, dtype=np.float64).sum(axis=0))
+        squares = np.zeros(factor.shape[1])
+        for rows in _blocks(len(factor)):
+            squares += np.square(factor[rows], dtype=np.float64).sum(axis=0)
+        values = np.sqrt(squares)
         good = (values > 0) & (values > values[0] * _ROUNDING)
         if not good.any():  # nothing moves: one mode of zeros, so that everything projects to zero
-            return Pod(np.zeros((len(factor), 1), np.float32), np.zeros(1), self.defect)
-        modes = factor[:, good] / values[good]
-        sign = np.sign(modes[np.abs(modes).argmax(axis=0), np.arange(modes.shape[1])])
-        return Pod((modes * sign).astype(np.float32), values[good], self.defect)
+            return Pod(np.zeros((len(factor), 1), np.float32), np.zeros(1), self._defect)
+        # In blocks: no further array is as large as all modes.
+        modes = np.empty((len(factor), int(good.sum())), np.float32)
+        for rows in _blocks(len(factor)):
+            modes[rows] = factor[rows][:, good] / values[good]
+        for k in range(modes.shape[1]):
+            if modes[np.abs(modes[:, k]).argmax(), k] < 0:
+                modes[:, k] *= -1
+        return Pod(modes, values[good], self._defect)
 
 
-def pod(runs: Iterable[NDArray[np.floating]], count: int) -> Pod:
+def pod(runs: Iterable[NDArray[np.floating]], count: int, keep: int | None = None) -> Pod:
     """The first `count` modes of all states of `runs`, each (state, node, 3); see `StreamedPod`."""
-    stream = StreamedPod(count)
+    stream = StreamedPod(count, keep)
     for run in runs:
         stream.add(run)
     return stream.result()
 
 
-def _pairs(old: NDArray[np.float32], new: NDArray[np.float32]) -> Iterator[NDArray[np.float64]]:
-    for k in range(0, len(new), _BLOCK):
-        yield np.hstack([old[k : k + _BLOCK].astype(np.float64), new[k : k + _BLOCK].astype(np.float64)])
+def _blocks(length: int) -> Iterator[slice]:
+    for first in range(0, length, _BLOCK):
+        yield slice(first, first + _BLOCK)

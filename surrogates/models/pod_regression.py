@@ -24,7 +24,7 @@ from surrogates.data.samples import Notes, scale_of
 from surrogates.errors import SurrogateError
 from surrogates.physics.choice import Worth, choose, not_used
 from surrogates.physics.registration import Registration
-from surrogates.physics.trials import Courses, Folds, Machine, Trials, courses_of
+from surrogates.physics.trials import Courses, Folds, Machine, Trials, courses_of, one_thread
 from surrogates.regression.gaussian import Gaussian, RadialBasis
 from surrogates.settings import Settings
 
@@ -190,16 +190,27 @@ def fit_pod_regression(
     scale_of(float(np.square(courses.own, dtype=np.float64).sum()))
     folds = _folds(campaign, settings, chosen)
     trials = Trials(courses, campaign.parameters[chosen], folds, settings.model, settings.seed)
+    with one_thread():
+        best, core, choice, worth = _chosen(campaign, settings, chosen, trials, notes)
+    core.modes = np.ascontiguousarray(courses.modes @ core.modes)
+    return PodFit(core, best.registration, choice, worth, lambda: _held(best, trials, settings, choice.modes))
+
+
+def _chosen(
+    campaign: Campaign, settings: Settings, chosen: NDArray[np.int64], trials: Trials, notes: Notes
+) -> tuple[_Candidate, PodRegression, PodChoice, Worth]:
+    """What the folds say, and the regression of all runs, its modes still (mode of the common basis, mode)."""
     registration, plane, worth = choose(campaign, chosen, settings, trials)
     for line in not_used(registration, settings):
         notes.add(line)
+    courses = trials.courses
     candidates = [_Candidate("trajectory", registration, plane)]
     if settings.pod.inputs == "point":
         candidates = [_Candidate("point", Registration.identity(campaign.parameter_names, courses.time), 0)]
     elif settings.pod.inputs == "auto" and registration.is_identity:
         candidates.append(_Candidate("point", registration, 0))
     counts = tuple(sorted({min(m, courses.own.shape[2]) for m in settings.pod.modes}))
-    if not len(folds.judged):
+    if not len(trials.folds.judged):
         best, count, errors = candidates[0], counts[-1], {}
         notes.add(
             f"{len(chosen)} runs cannot be told apart by folds; {count} modes and {best.view} inputs are taken unseen"
@@ -209,8 +220,7 @@ def fit_pod_regression(
         errors = {c: _errors(c, trials, settings, counts) for c in candidates}
         best, count = _best(errors, counts)
     choice = PodChoice(best.view, count, _named(errors, counts))
-    core = _fitted(best, trials, settings, count)
-    return PodFit(core, best.registration, choice, worth, lambda: _held(best, trials, settings, count))
+    return best, _fitted(best, trials, settings, count), choice, worth
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,8 +296,8 @@ def _fitted(candidate: _Candidate, trials: Trials, settings: Settings, count: in
         machine = trials.fitted(registration, inputs, values)
         turn = _rotation(values)(count)
         data = Coefficients(over_range(inputs, inputs), registration.grid, values)
-        core = PodRegression(courses.modes, data, machine, "trajectory", inputs.min(axis=0), inputs.max(axis=0))
-    core.modes = np.ascontiguousarray(courses.modes @ turn)
+        core = PodRegression(turn, data, machine, "trajectory", inputs.min(axis=0), inputs.max(axis=0))
+    core.modes = turn
     core.data.values = np.ascontiguousarray(core.data.values @ turn)
     return core
 
@@ -325,11 +335,12 @@ def _rotation(values: NDArray[np.float32]) -> Callable[[int], NDArray[np.float32
 
 
 def _held(candidate: _Candidate, trials: Trials, settings: Settings, count: int) -> Iterator[Held]:
-    for part, held, course, deviations in _fold_courses(candidate, trials, settings):
+    with one_thread():
+        folds = list(_fold_courses(candidate, trials, settings))
+    for part, held, course, deviations in folds:
         turn = _rotation(part)(count)
-        modes = (trials.courses.modes @ turn).astype(np.float32)
-        for run, states, deviation in zip(held, course @ turn, deviations, strict=True):
-            yield Held(int(run), (states @ modes.T).reshape(len(states), -1, 3), float(deviation))
+        for run, states, deviation in zip(held, (course @ turn) @ turn.T, deviations, strict=True):
+            yield Held(int(run), (states @ trials.courses.modes.T).reshape(len(states), -1, 3), float(deviation))
 
 
 def _points(data: Coefficients) -> NDArray[np.float64]:

@@ -34,7 +34,7 @@ from surrogates.physics.derived import (
 )
 from surrogates.physics.registration import Registration
 from surrogates.physics.symmetry import Symmetry, may_be_odd
-from surrogates.physics.trials import Folds, Trials, courses_of
+from surrogates.physics.trials import Folds, Trials, courses_of, one_thread
 from surrogates.settings import Settings
 
 _log = logging.getLogger(__name__)
@@ -311,7 +311,8 @@ def of_campaign(
     courses = courses_of(campaign, settings, everyone, notes)
     folds = Folds.of(len(everyone), settings.validation.folds, settings.seed)
     trials = Trials(courses, campaign.parameters, folds, "pod-gpr", settings.seed)
-    registration, _, worth = choose(campaign, everyone, settings, trials)
+    with one_thread():
+        registration, _, worth = choose(campaign, everyone, settings, trials)
     for line in not_used(registration, settings):
         notes.add(line)
     return registration, worth

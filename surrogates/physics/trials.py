@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -31,6 +32,9 @@ MODES = 128
 _NUMBERS = 3e8
 # Singular values below this share of the largest are rounding.
 _SMALLEST = 1e-5
+_TRANSLATIONS = 3
+# Modes carried along beside those of the basis, and rows of it worked on at once.
+_KEPT_BESIDE, _ROWS = 32, 1 << 13
 # States of a run that the basis is made of, nodes and states on which errors are measured, states of the likelihood.
 _BASIS_STATES = 32
 _JUDGED_NODES, _JUDGED_STATES = 400, 21
@@ -39,6 +43,14 @@ _LIKELIHOOD_STATES = 21
 _LEAVE_ONE = 12
 # How often they are parted anew, by the largest number of runs.
 _ROUNDS = ((32, 2), (1 << 62, 1))
+
+
+def one_thread() -> AbstractContextManager[object]:
+    """Inside, matrix products take one thread: those of trials are small, and sharing them costs more than they do."""
+    from threadpoolctl import threadpool_limits
+
+    limits: AbstractContextManager[object] = threadpool_limits(1, user_api="blas")
+    return limits
 
 
 @dataclass(frozen=True)
@@ -116,7 +128,7 @@ class Courses:
         """The runs `chosen`, read twice: once for the basis, once for the coefficients."""
         length = 3 * runs.nodes
         count = int(max(8, min(modes, _NUMBERS / length / 3)))
-        basis = np.concatenate([_translations(runs.nodes), _without_translations(runs, chosen, mirrors, count)], axis=1)
+        basis = _basis(runs, chosen, mirrors, count)
         own = np.empty((len(chosen), runs.states, basis.shape[1]), np.float32)
         images = {k: np.empty_like(own) for k in range(len(mirrors))}
         draw = np.random.default_rng(seed)
@@ -304,37 +316,47 @@ def courses_of(campaign: Campaign, settings: Settings, chosen: NDArray[np.int64]
     return Courses.of(campaign, runs, chosen, campaign.mirrors, modes, settings.seed)
 
 
-def _translations(nodes: int) -> NDArray[np.float32]:
-    """(3 * node, 3): the structure as a whole moved along each axis, of length 1."""
-    return np.tile(np.eye(3, dtype=np.float32), (nodes, 1)) / np.float32(np.sqrt(nodes))
-
-
-def _without_translations(
-    runs: LevelRuns, chosen: NDArray[np.int64], mirrors: Sequence[Mirror], count: int
-) -> NDArray[np.float32]:
-    """(3 * node, mode): POD of runs and images, of what is left without their translation."""
+def _basis(runs: LevelRuns, chosen: NDArray[np.int64], mirrors: Sequence[Mirror], count: int) -> NDArray[np.float32]:
+    """(3 * node, mode): the structure as a whole moved along each axis, then the POD of runs and images, of what is
+    left without their translation; orthonormal."""
 
     def states() -> Iterator[NDArray[np.float32]]:
-        held: list[NDArray[np.float32]] = []
         for k, run in enumerate(chosen):
             _log.info("modes of run %d of %d%s", k + 1, len(chosen), " and its images" if mirrors else "")
             values = runs.read(run)
             values = values[np.unique(np.linspace(0, len(values) - 1, _BASIS_STATES).astype(int))]
-            for part in (values, *(mirrored(mirror, values) for mirror in mirrors)):
-                held.append(part - part.mean(axis=1, keepdims=True))
-            if sum(map(len, held)) >= 2 * count:  # a few runs at once cost less than one by one
-                yield np.concatenate(held)
-                held = []
-        if held:
-            yield np.concatenate(held)
+            for image in (None, *mirrors):
+                part = values if image is None else mirrored(image, values)
+                yield part - part.mean(axis=1, keepdims=True)
 
-    basis = pod(states(), count)
-    good = basis.singular_values > _SMALLEST * basis.singular_values[0]
-    if not good.any():
-        return basis.modes[:, :0]
-    modes = basis.modes[:, good].reshape(-1, 3, int(good.sum()))
-    modes -= modes.mean(axis=0, dtype=np.float64)  # what rounding left of translations in faint modes
-    return np.asarray(np.linalg.qr(modes.reshape(len(modes) * 3, -1))[0], np.float32)
+    found = pod(states(), count, keep=count + _KEPT_BESIDE)
+    good = found.singular_values > _SMALLEST * found.singular_values[0]
+    moving = int(good.sum()) if good.any() else 0  # nothing moves: one mode of zeros is given
+    out = np.zeros((3 * runs.nodes, _TRANSLATIONS + moving), np.float32)
+    out.reshape(-1, 3, out.shape[1])[:, :, :_TRANSLATIONS] = np.eye(3) / np.sqrt(runs.nodes)
+    if moving:
+        out[:, _TRANSLATIONS:] = found.modes[:, good]
+        del found
+        _orthonormal(out)
+    return out
+
+
+def _orthonormal(modes: NDArray[np.float32]) -> None:
+    """Gram-Schmidt of columns that are nearly orthonormal already, in place: what rounding left in faint modes.
+
+    By the Cholesky factor of their products, twice (Yamamoto et al. 2015, doi 10.1553/etna_vol44s306).
+    """
+    from scipy.linalg import solve_triangular
+
+    for _ in range(2):
+        gram = np.zeros((modes.shape[1],) * 2)
+        blocks = [slice(k, k + _ROWS) for k in range(0, len(modes), _ROWS)]
+        for rows in blocks:
+            some = modes[rows].astype(np.float64)
+            gram += some.T @ some
+        turn = solve_triangular(np.linalg.cholesky(gram), np.eye(len(gram)), lower=True).T
+        for rows in blocks:
+            modes[rows] = modes[rows].astype(np.float64) @ turn
 
 
 def _at(course: NDArray[np.float32], trained: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float32]:
