@@ -92,8 +92,8 @@ class Model:
         extrapolate
             Also far outside the trained range: by more than a quarter of it.
         band
-            Also `half_width`, m: this share (0.9) of nodes and states is as close to the truth, as far as the
-            validation runs tell.
+            Also `half_width`, m: a prediction band that should contain this share of nodes and states, e.g. 0.9. Its
+            width comes from errors on runs that were left out in training.
         sensitivity
             Also `displacement_by_NAME`: the derivative by each parameter. For one run.
 
@@ -126,14 +126,15 @@ class Model:
         at = self.time if time is None else np.atleast_1d(np.asarray(time, np.float64))
         number = surrogate.number(level)
         full = level is None if full is None else full
-        outside = list(dict.fromkeys(sentence for row in values for sentence in surrogate.outside(row, at)))
-        far = set() if extrapolate else {name for row in values for name in far_outside(ranges, row[None], at)}
-        if far:
-            said = "; ".join(s for s in outside if s.split(" = ")[0] in far)
+        beyond = [ranges.beyond(*surrogate.checked(row, at)) for row in values]
+        far = [[] if extrapolate else far_outside(ranges, row[None], at) for row in values]
+        if any(far):
+            said = dict.fromkeys(of_run[name] for of_run, names in zip(beyond, far, strict=True) for name in names)
             raise DataError(
-                f"{said}: that is far outside, and nothing is known there; check the value and its unit, or extrapolate "
-                "with --extrapolate"
+                f"{'; '.join(said)}: that is far outside, and nothing is known there; check the value and its unit, or "
+                "extrapolate: --extrapolate, from Python extrapolate=True"
             )
+        outside = list(dict.fromkeys(sentence for of_run in beyond for sentence in of_run.values()))
         if sensitivity and len(values) > 1:
             raise DataError(f"sensitivities are those of one run; found parameters of {len(values)}")
         u = surrogate.predict_full(values, at, number) if full else surrogate.predict(values, at, number)

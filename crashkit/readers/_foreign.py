@@ -7,9 +7,9 @@ from itertools import islice
 from pathlib import Path
 
 from crashkit.readers._folders import files_in
+from crashkit.readers._hdf5_data import SIGNATURE
 from crashkit.readers.checks import LIBRARY_ERRORS
 
-_HDF5 = b"\x89HDF\r\n\x1a\n"
 # Suffix -> what it is and what to do. Told by suffix alone, since the contents are secret.
 _BY_SUFFIX = {
     ".fz": "is packed with FEMZIP, which needs a licence to read; unpack it first (femunzip)",
@@ -87,7 +87,7 @@ def _file(path: Path) -> str | None:
         return _named(path, f"is packed with {packed}; unpack it first")
     if start[:3] == b"CDF" and start[3:4] in b"\x01\x02\x05":
         return _named(path, "is a classic NetCDF file and no Exodus file with states; write Exodus, or a crash dataset")
-    return _named(path, found) if start.startswith(_HDF5) and (found := _hdf5(path)) else None
+    return _named(path, found) if start.startswith(SIGNATURE) and (found := _hdf5(path)) else None
 
 
 def _hdf5(path: Path) -> str | None:

@@ -8,6 +8,7 @@ from typing import Any
 
 from crashkit.errors import ReadError
 
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
 # Virtual datasets may be made of virtual datasets, at most this deep.
 _DEPTH = 4
 

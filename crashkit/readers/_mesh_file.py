@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
 from crashkit.extras import need
+from crashkit.readers._cells import stack_cells
 
 # Rounding in files of few digits changes edge lengths by less than this.
 _EDGE_TOLERANCE = 0.02
@@ -62,7 +63,7 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
         raise ReadError(f"{path}: not readable as a mesh ({error})") from error
     points = np.zeros((len(mesh.points), 3))
     points[:, : mesh.points.shape[1]] = mesh.points
-    return points, _stack([b.data for b in mesh.cells if b.type in ("triangle", "quad")])
+    return points, stack_cells([np.asarray(b.data, np.int32) for b in mesh.cells if b.type in ("triangle", "quad")])
 
 
 def _read_vtk(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
@@ -75,11 +76,5 @@ def _read_vtk(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     if not isinstance(mesh, (pyvista.PolyData, pyvista.UnstructuredGrid)):
         raise ReadError(f"{path}: holds {type(mesh).__name__}, expected a mesh of triangles or quadrilaterals")
     cells = mesh.cast_to_unstructured_grid().cells_dict
-    groups = [np.asarray(nodes) for kind, nodes in cells.items() if kind in (5, 9)]
-    return np.asarray(mesh.points, np.float64), _stack(groups)
-
-
-def _stack(groups: list[NDArray[np.integer]]) -> NDArray[np.int32]:
-    corners = max((g.shape[1] for g in groups), default=3)
-    padded = [np.pad(g, ((0, 0), (0, corners - g.shape[1])), constant_values=-1) for g in groups]
-    return np.concatenate(padded or [np.empty((0, 3), np.int32)]).astype(np.int32)
+    groups = [np.asarray(nodes, np.int32) for kind, nodes in cells.items() if kind in (5, 9)]
+    return np.asarray(mesh.points, np.float64), stack_cells(groups)

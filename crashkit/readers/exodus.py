@@ -28,14 +28,14 @@ from crashkit.readers import register
 from crashkit.readers._folders import Collected, files_in, named, recognises, runs_in
 from crashkit.readers._grid import Grid, GridSource, Place
 from crashkit.readers._grid_run import GridRun
-from crashkit.readers._hdf5_data import files_behind
+from crashkit.readers._hdf5_data import SIGNATURE, files_behind
 from crashkit.readers._names import vectors_among
 from crashkit.readers.base import Run, Runs
 from crashkit.readers.checks import LIBRARY_ERRORS, reading, require_options
 
 # Zeros behind a classic file up to this many are padding.
 _PADDING = 1 << 20
-_CLASSIC, _HDF5 = (b"CDF\x01", b"CDF\x02"), b"\x89HDF\r\n\x1a\n"
+_CLASSIC = (b"CDF\x01", b"CDF\x02")
 # Beginning of an element type's name -> corners, VTK type. Nodes behind the corners are in the middle of edges.
 _SHAPES = {
     "TRI": (3, 5), "QUAD": (4, 9), "SHELL": (4, 9), "TET": (4, 10), "HEX": (8, 12), "WEDGE": (6, 13), "PYR": (5, 14),
@@ -119,7 +119,7 @@ def _is_exodus(file: Path) -> bool:
         if start[:4] in _CLASSIC:
             head = stream.read(1 << 16)
             return b"num_nodes" in head and b"num_el_blk" in head
-    if start != _HDF5:
+    if start != SIGNATURE:
         return False
     import h5py
 

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
 from crashkit.readers import register
-from crashkit.readers._hdf5_data import files_behind
+from crashkit.readers._hdf5_data import SIGNATURE, files_behind
 from crashkit.readers._names import quantity
 from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh, Runs
 from crashkit.readers.checks import (
@@ -51,7 +51,6 @@ from data_schema.units import quantity_in
 if TYPE_CHECKING:
     import h5py
 
-_MAGIC = b"\x89HDF\r\n\x1a\n"
 _NEEDED = ("displacements", "reference_configuration")
 _KART_PARAMETERS = (("impact_speed", "m s-1"), ("impact_angle", "degree"), ("yield_stress", "MPa"))
 _METRE = ("m", "metre", "meter")
@@ -72,7 +71,7 @@ class KartHdf5:
             if not path.is_file():
                 return False
             with path.open("rb") as stream:
-                if stream.read(8) != _MAGIC:
+                if stream.read(8) != SIGNATURE:
                     return False
             with h5py.File(path, "r") as file:
                 return _group(file) is not None

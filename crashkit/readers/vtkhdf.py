@@ -22,11 +22,10 @@ from crashkit.readers import register
 from crashkit.readers._folders import Collected, one_file_each, recognises
 from crashkit.readers._grid import Grid, GridSource, Place
 from crashkit.readers._grid_run import GridRun
-from crashkit.readers._hdf5_data import files_behind
+from crashkit.readers._hdf5_data import SIGNATURE, files_behind
 from crashkit.readers.base import Run, Runs
 from crashkit.readers.checks import LIBRARY_ERRORS, reading, require_options
 
-_MAGIC = b"\x89HDF\r\n\x1a\n"
 _GRIDS = ("UnstructuredGrid", "PolyData")
 _COLLECTIONS = ("PartitionedDataSetCollection", "MultiBlockDataSet")
 _POLYDATA = {"Vertices": 2, "Lines": 4, "Polygons": 7}
@@ -60,7 +59,7 @@ def _is_vtkhdf(file: Path) -> bool:
     if not file.is_file():
         return False
     with file.open("rb") as stream:
-        if stream.read(8) != _MAGIC:
+        if stream.read(8) != SIGNATURE:
             return False
     try:
         with h5py.File(file, "r") as opened:

@@ -58,7 +58,11 @@ class Ranges:
 
     def outside(self, parameters: NDArray[np.float64], time: NDArray[np.float64]) -> list[str]:
         """One sentence for each parameter (and the time) beyond the trained range; parameters (..., parameter)."""
-        said = []
+        return list(self.beyond(parameters, time).values())
+
+    def beyond(self, parameters: NDArray[np.float64], time: NDArray[np.float64]) -> dict[str, str]:
+        """The same sentences by the name of the parameter, or "time"."""
+        said = {}
         values = np.atleast_2d(parameters)
         for k, (name, (unit, factor)) in enumerate(zip(self.names, self.written, strict=True)):
             low, high = self.low[k], self.high[k]
@@ -68,11 +72,11 @@ class Ranges:
             if worst < low - slack or worst > high + slack:
                 span = f"{low / factor:g} to {high / factor:g}" if low < high else f"only {low / factor:g}"
                 behind = "" if unit in ("", "1") else f" {unit}"
-                said.append(f"{name} = {worst / factor:g}{behind} is outside the trained range {span}{behind}")
+                said[name] = f"{name} = {worst / factor:g}{behind} is outside the trained range {span}{behind}"
         first, last = self.time
         beyond = [t for t in (time.min(), time.max()) if t < first - 1e-12 or t > last * (1 + 1e-9) + 1e-12]
         if beyond:
-            said.append(f"time = {beyond[-1]:g} s is outside the trained range {first:g} to {last:g} s")
+            said["time"] = f"time = {beyond[-1]:g} s is outside the trained range {first:g} to {last:g} s"
         return said
 
 
