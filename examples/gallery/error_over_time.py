@@ -13,4 +13,4 @@ for name in ("mh", "pod-gpr"):
 plt.xlabel("time (ms)")
 plt.ylabel("mean node error (cm)")
 plt.legend()
-plt.savefig("error_over_time.png", dpi=120)
+plt.savefig("error_over_time.png", dpi=120, bbox_inches="tight")

@@ -13,5 +13,5 @@ for column, level in enumerate(levels):
     plot.add_points(mesh.points[level.kept], color="crimson", point_size=7, render_points_as_spheres=True)
     plot.add_text(f"level {level.index}: {len(level.kept)} nodes", font_size=10)
 plot.link_views()
-plot.camera.zoom(1.3)
+plot.camera.zoom(1.2)
 plot.screenshot("levels.png")

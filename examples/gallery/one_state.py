@@ -7,7 +7,8 @@ import crashkit
 runs = crashkit.open_dataset("kart.zarr")
 plot = pv.Plotter(off_screen=True, window_size=(900, 600))
 mesh = runs.crash.to_pyvista(sim="run_022", time=0.03)
-plot.add_mesh(mesh, scalars="displacement", scalar_bar_args={"title": "displacement (m)"})
+bar = {"title": "displacement (m)\n", "vertical": True, "position_x": 0.86, "position_y": 0.1, "height": 0.8}
+plot.add_mesh(mesh, scalars="displacement", scalar_bar_args=bar)
 plot.camera_position = "iso"
-plot.camera.zoom(1.4)
+plot.camera.zoom(1.3)
 plot.screenshot("one_state.png")
