@@ -51,7 +51,8 @@ def draw_levels(
         axes[0, k + 1].imshow(above)
         axes[1, k + 1].imshow(below)
         axes[0, k + 1].set_title(
-            f"level {level.index}: {level.n_nodes} nodes\ninterpolation error {100 * lifting_error[k]:.3f} cm", fontsize=10
+            f"level {level.index}: {level.n_nodes} nodes\ninterpolation error {100 * lifting_error[k]:.3f} cm",
+            fontsize=10,
         )
     for ax in axes.ravel():
         ax.set_axis_off()
