@@ -73,35 +73,6 @@ class KeptNodes:
     edges: NDArray[np.integer]
 
 
-def field_picture(
-    points: ArrayLike,
-    faces: ArrayLike,
-    displacement: ArrayLike,
-    values: ArrayLike,
-    label: str,
-    sheet: Sheet | None = None,
-    title: str = "",
-    limits: Limits | None = None,
-    colours: str = DISPLACEMENT,
-    alive: ArrayLike | None = None,
-) -> Figure:
-    """A field on the deformed mesh.
-
-    Parameters
-    ----------
-    points
-        (n, 3) m; displacement (n, 3) m.
-    values
-        (n,) or (m,) in the unit that `label` names; by default between 0, or the smallest, and the largest.
-    """
-    sheet = sheet or Sheet()
-    position = np.asarray(points) + np.asarray(displacement)
-    scale = Scale(label, limits or limits_of(values), colours)
-    view = choose_view([position], faces)
-    image = render(position, faces, view, values, scale.limits, colours, _pixels(sheet, 1), alive=alive)
-    return _sheet_of([[Panel(image, title)]], [scale], sheet)
-
-
 def comparison_picture(
     points: ArrayLike,
     faces: ArrayLike,
@@ -251,17 +222,6 @@ def states_at(time: ArrayLike, shares: Sequence[float]) -> list[int]:
     """The states nearest to `shares` of the way from the first to the last time (t,)."""
     times = np.asarray(time, np.float64)
     return [int(np.argmin(abs(times - times[0] - share * (times[-1] - times[0])))) for share in shares]
-
-
-def to_png(image: Image) -> bytes:
-    """A plain image (height, width, 3) as bytes of a PNG file."""
-    import io
-
-    from PIL import Image as Picture
-
-    out = io.BytesIO()
-    Picture.fromarray(image).save(out, "png", optimize=True)
-    return out.getvalue()
 
 
 def _pixels(sheet: Sheet, across: int) -> int:

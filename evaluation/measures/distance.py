@@ -91,11 +91,6 @@ def relative_error(truth: NDArray[np.floating], distance: NDArray[np.float64]) -
     return float(np.sqrt(np.square(distance[there]).sum() / size)) if size > 0 else float("nan")
 
 
-def mean_displacement(truth: NDArray[np.floating]) -> NDArray[np.float64]:
-    """(state,) m: the mean |q|_2 over the living nodes, what an error is to be held against."""
-    return mean_node_error(node_distance(truth, np.zeros_like(truth)))
-
-
 @dataclass(frozen=True)
 class Peak:
     """The largest node error of a run: its value (m), and the state and node where it stands."""

@@ -171,12 +171,3 @@ def _grid(low: NDArray[np.float64], high: NDArray[np.float64], steps: int = 9) -
             line[:, -1] = t if k < len(low) - 1 else line[:, -1]
             edges.append(line)
     return np.concatenate(edges)
-
-
-def rms(displacement: NDArray[np.float32] | Tensor) -> float:
-    """Root mean square of all components, m: the one number a level's states are divided by; 1 where all are zero."""
-    if isinstance(displacement, Tensor):
-        value = float(displacement.double().square().mean().sqrt())
-    else:
-        value = float(np.sqrt(np.mean(np.square(displacement, dtype=np.float64))))
-    return value if value > 0 else 1.0

@@ -8,20 +8,17 @@ from importlib.resources import files
 import h5py
 import numpy as np
 import pytest
-from PIL import Image
 
 from crashkit.writers.paraview import write_paraview
 from evaluation.drawing.pictures import (
     KeptNodes,
     Row,
     comparison_picture,
-    field_picture,
     file_picture,
     kept_nodes_picture,
     limits_of,
     states_at,
     states_picture,
-    to_png,
 )
 from evaluation.drawing.style import Sheet
 from evaluation.errors import EvaluationError
@@ -119,15 +116,6 @@ def test_rows_of_states_name_row_time_and_scale(run):
     assert sum(bool(axes.images) for axes in figure.axes) == 6
 
 
-def test_a_field_on_faces_is_drawn_with_its_limits(run):
-    values = np.linspace(0.1, 0.4, len(run["faces"]))
-    figure = field_picture(
-        run["points"], run["faces"], run["truth"][-1], values, "plastic strain", SHEET, "run 5", alive=values < 0.39
-    )
-    assert texts(figure) == ["run 5"]
-    assert bars(figure) == {"plastic strain": (0.0, pytest.approx(0.4))}
-
-
 def test_kept_nodes_are_counted(run):
     kept = np.arange(0, len(run["points"]), 30)
     edges = np.stack([np.arange(len(kept) - 1), np.arange(1, len(kept))], axis=1)
@@ -144,11 +132,6 @@ def test_limits_and_states():
     assert limits_of([-1.0, 2.0]) == (-1.0, 2.0)
     assert limits_of([np.nan]) == (0.0, 1.0)
     assert states_at(np.linspace(0, 0.03, 101), (1 / 3, 2 / 3, 1)) == [33, 67, 100]
-
-
-def test_a_png_holds_the_image():
-    image = np.random.default_rng(0).integers(0, 255, (5, 7, 3)).astype(np.uint8)
-    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(to_png(image)))), image)
 
 
 def test_arrays_of_different_meshes_are_refused(run):

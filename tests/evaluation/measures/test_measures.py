@@ -13,7 +13,6 @@ from evaluation.measures.distance import (
     group_error,
     largest_node_error,
     masked_mean,
-    mean_displacement,
     mean_node_error,
     node_distance,
     peak_error,
@@ -110,11 +109,6 @@ def test_group_error_counts_every_state_the_same():
     distance = np.array([[1.0, 3.0, 9.0], [np.nan, 5.0, 9.0]])
     assert group_error(distance, [np.array([0, 1]), np.array([2])]).tolist() == [(2.0 + 5.0) / 2, 9.0]
     assert np.isnan(group_error(distance, [np.array([], int)])).all()
-
-
-def test_mean_displacement_is_the_error_of_predicting_nothing():
-    truth = np.random.default_rng(1).normal(size=(2, 7, 3))
-    np.testing.assert_allclose(mean_displacement(truth), np.linalg.norm(truth, axis=-1).mean(axis=1))
 
 
 def test_masked_mean_warns_of_nothing_and_knows_axes():

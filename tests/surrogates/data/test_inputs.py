@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from surrogates.data.inputs import InputScaling, Ranges, far_outside, over_range, rms
+from surrogates.data.inputs import InputScaling, Ranges, far_outside, over_range
 
 NAMES, UNITS = ("impact_speed", "impact_angle", "yield_stress"), ("m s-1", "degree", "Pa")
 
@@ -161,16 +161,6 @@ def test_a_small_change_of_a_large_parameter_is_seen() -> None:
 
 def test_the_ranges_are_not_among_the_weights() -> None:
     assert InputScaling(box((0.0, 1.0))).state_dict() == {}
-
-
-@pytest.mark.parametrize("kind", [lambda u: u, torch.from_numpy], ids=["numpy", "torch"])
-def test_rms_is_the_root_of_the_mean_square_of_all_components(kind) -> None:  # type: ignore[no-untyped-def]
-    u = np.zeros((2, 2, 3), np.float32)
-    u[0, 0] = [1, 2, 2]
-    u[1, 1] = [0, 0, 5]
-    assert rms(kind(u)) == pytest.approx(np.sqrt((9 + 25) / 12))
-    assert rms(kind(np.zeros((2, 2, 3), np.float32))) == 1.0
-    assert rms(kind(np.full((2, 2, 3), 1e-25, np.float32))) == pytest.approx(1e-25, rel=1e-6)
 
 
 def test_values_outside_are_told_in_the_unit_people_write() -> None:
