@@ -103,10 +103,7 @@ class Coverage:
             if outside
             else (" No test run lies outside the ranges of the training runs." if self.test.any() else "")
         )
-        return (
-            f"Where the runs lie in the design space: {'; '.join(ranges)}. About empty patches the data says "
-            f"nothing.{note}"
-        )
+        return f"Where the runs lie in the design space: {'; '.join(ranges)}. There are no runs in the empty regions.{note}"
 
 
 def select(evaluation: Evaluation) -> Coverage | None:

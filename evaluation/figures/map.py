@@ -71,13 +71,13 @@ class ErrorMap:
 
     def caption(self) -> str:
         model, errors = next(iter(self.errors.items()))
-        worst, middle = int(np.nanargmax(errors)), float(np.nanmedian(errors))
+        worst, median = int(np.nanargmax(errors)), float(np.nanmedian(errors))
         return (
             f"Mean error of every node over all test runs and times, on the undeformed structure and in one "
             f"scale; the blue "
             f"dot is the worst node. With {model} that is node {int(self.node_id[worst])} with "
             f"{errors[worst] * CM:.2f} cm, "
-            f"{errors[worst] / middle if middle > 0 else float('nan'):.1f} times the middle of all nodes. Dark "
+            f"{errors[worst] / median if median > 0 else float('nan'):.1f} times the median of all nodes. Dark "
             f"places are "
             f"where a prediction should not be read off."
         )

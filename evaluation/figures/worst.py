@@ -61,8 +61,7 @@ class WorstState:
             f"The worst that {self.model}, the most accurate model, does: {called(self.run)} at {self.time * MS:.1f} "
             f"ms, with the "
             f"mean node error {float(masked_mean(error)) * CM:.2f} cm. Truth and prediction share one scale, and the "
-            f"grey shadow behind the prediction is the truth. The largest error, {error[node] * CM:.2f} cm, "
-            f"stands at node "
+            f"grey shadow behind the prediction is the truth. The largest error, {error[node] * CM:.2f} cm, is at node "
             f"{int(self.node_id[node])}. The numbers list the {min(_LISTED, len(error))} worst nodes."
         )
 

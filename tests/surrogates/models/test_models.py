@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -24,6 +25,12 @@ SHORT = ("level.epochs=4", "transfer.epochs=1", "level.batch=16")
 
 def trained(model: str, *overrides: str, runs: int = 10, **more: object) -> Surrogate:
     return train_surrogate(plate.campaign(runs), settings(model, overrides=[*SHORT, *overrides]), **more)  # type: ignore[arg-type]
+
+
+@functools.cache
+def short() -> Surrogate:
+    """The default cascade after a few epochs; not to be changed."""
+    return trained("mh")
 
 
 def e2(surrogate: Surrogate, level: int, mu: np.ndarray) -> float:
@@ -56,7 +63,8 @@ def e2(surrogate: Surrogate, level: int, mu: np.ndarray) -> float:
     ids=lambda value: value if isinstance(value, str) else " ".join(value) or "default",
 )
 def test_every_model_learns_and_survives_storage(model: str, overrides: Sequence[str], tmp_path: Path) -> None:
-    surrogate = trained(model, "level.epochs=12", *overrides)
+    off = ("inputs.derived=off",) if overrides else ()  # searching inputs once is enough
+    surrogate = trained(model, "level.epochs=12", *off, *overrides)
     mu = plate.parameters(2, seed=7)
     for name, level in surrogate.level_names.items():
         history = surrogate.history(level)
@@ -83,9 +91,8 @@ def test_the_cascade_learns_the_plate() -> None:
 
 
 def test_a_finer_level_does_not_change_the_coarser_ones_by_one_bit() -> None:
-    before: dict[str, torch.Tensor] = {}
     coarse_alone = trained("mh", "levels=[2]")
-    both = trained("mh", "levels=[2, 1]")
+    both = short()
     assert isinstance(coarse_alone.core, Cascade)
     assert isinstance(both.core, Cascade)
     before = coarse_alone.core.levels[2].own_state()
@@ -98,7 +105,7 @@ def test_a_finer_level_does_not_change_the_coarser_ones_by_one_bit() -> None:
 
 def test_the_same_seed_gives_the_same_model_and_another_one_another() -> None:
     mu = plate.parameters(1, seed=3)[0]
-    first, second, third = trained("mh"), trained("mh"), trained("mh", "seed=1")
+    first, second, third = short(), trained("mh"), trained("mh", "seed=1")
     np.testing.assert_array_equal(first.predict(mu), second.predict(mu))
     assert not np.array_equal(first.predict(mu), third.predict(mu))
 
@@ -123,7 +130,7 @@ def test_a_killed_training_resumed_gives_the_same_cascade(tmp_path: Path) -> Non
     )  # fmt: skip
     assert told == ["MH1 3", "MH1 4"]
     mu = plate.parameters(2, seed=3)
-    whole = train_surrogate(campaign, chosen)
+    whole = short()
     for level in (2, 1):
         np.testing.assert_array_equal(resumed.predict(mu, level=level), whole.predict(mu, level=level))
 
@@ -143,7 +150,7 @@ def test_ctrl_c_leaves_a_usable_model(tmp_path: Path) -> None:
 def test_divergence_names_the_level_and_hands_over_what_is_good() -> None:
     with pytest.raises(Diverged, match="MH2: the loss is not finite in epoch") as caught:
         trained("mh", "level.regression=network", "at.2.learning_rate=1e30", "at.2.schedule=constant", "at.2.clip=0")
-    assert caught.value.surrogate is None or np.isfinite(caught.value.surrogate.predict(plate.parameters(1)[0])).all()
+    assert caught.value.surrogate is None  # no level is finished, and no epoch ended well
 
 
 def test_where_a_network_diverges_beside_a_process_the_process_is_used() -> None:
@@ -166,7 +173,7 @@ def test_a_finer_level_that_diverges_leaves_the_coarser_ones(regression: str) ->
 
 
 def test_any_number_of_levels_and_states_can_be_asked_at_once() -> None:
-    surrogate = trained("mh")
+    surrogate = short()
     mu = plate.parameters(3, seed=5)
     together = surrogate.predict(mu, plate.TIME[2:4])
     alone = surrogate.predict(mu[1], plate.TIME[3])
@@ -175,7 +182,7 @@ def test_any_number_of_levels_and_states_can_be_asked_at_once() -> None:
 
 
 def test_lifting_is_the_static_upsampling() -> None:
-    surrogate = trained("mh")
+    surrogate = short()
     mu = plate.parameters(1, seed=5)[0]
     up = plate.levels()[1].to_full.toarray()
     expected = np.einsum("fc,tcx->tfx", up, surrogate.predict(mu, level=2))
@@ -197,7 +204,7 @@ def test_lifting_is_the_static_upsampling() -> None:
 )
 def test_bad_questions_are_answered_in_words(ask, message: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(SurrogateError, match=message):
-        ask(trained("mh", "level.epochs=1"))
+        ask(short())
 
 
 @pytest.mark.parametrize("model", ["mh", "podnn"])
