@@ -8,6 +8,7 @@ way is still a run. Ratios compose, so the reference is a change of variables of
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -75,10 +76,15 @@ class Clock:
         return np.asarray(parameters[:, self.speed] / self.reference[self.speed] / self.rate(parameters))
 
     def grid(self, parameters: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Reference times (state,) that hold all runs to their ends: the steps of `time` at the reference's own rate."""
+        """Reference times (state,) that hold every run of the box around `parameters` (run, parameter) to its end.
+
+        The steps are those of `time` at the reference's own rate. No run need lie where the box is fastest; a query may.
+        """
         if self.speed is None or len(time) < 2:
             return time
-        span = (time[-1] - self.start) * min(float(self.rate(parameters).max()), _LONGEST)
+        used = [k for k, power in enumerate(self.exponents) if power]
+        fastest = math.prod(float(((parameters[:, k] / self.reference[k]) ** self.exponents[k]).max()) for k in used)
+        span = (time[-1] - self.start) * min(fastest, _LONGEST)
         first = (time[0] - self.start) * float(self.rate(parameters).min())
         count = int(np.ceil((span - first) / np.median(np.diff(time)) - 1e-9))
         return np.asarray(self.start + np.linspace(first, span, max(count, 1) + 1))
