@@ -395,12 +395,21 @@ def settings(
 ) -> Settings:
     """The settings for one training.
 
-    file       YAML with the fields of `Settings`; its `model` and `preset` hold unless given here
-    overrides  a dictionary, nested or with dotted paths: {"level": {"epochs": 20}} or {"level.epochs": 20}; or texts
-               "path=value" with a dotted path and a YAML value, such as "level.mlp.widths=[32, 32]" or "at.3.epochs=9";
-               or a list of both, of which later ones win
+    Parameters
+    ----------
+    model, preset
+        Kind of model and preset; default: what `file` says, else `mh` and `fast`.
+    file
+        YAML with the fields of `Settings`.
+    overrides
+        A dictionary, nested or with dotted paths: {"level": {"epochs": 20}} or {"level.epochs": 20}; or texts
+        "path=value" with a dotted path and a YAML value, such as "level.mlp.widths=[32, 32]" or "at.3.epochs=9"; or a
+        list of both, of which later ones win.
 
-    Raises SurrogateError naming the field, what was found and what is possible.
+    Raises
+    ------
+    SurrogateError
+        Naming the field, what was found and what is possible.
     """
     given: dict[Any, Any] = _read(Path(file)) if file is not None else {}
     given = _merged(given, _given(overrides))

@@ -22,6 +22,8 @@ NEAR = 1.25  # "nearly as exact": at most a quarter worse than the best
 # Share of the mean error: a larger displacement in the first state, where nothing has moved, gives a warning.
 START_SHARE = 0.1
 BAND_HOLDS = 0.8  # a 90 % band that holds less than this share on test runs gives a warning
+OUTLIER = 2.0  # a test run whose error is more than this many times the median gives a warning
+MOSTLY_REGRESSION, MOSTLY_COMPRESSION = 0.5, 0.8  # shares of the error that compression alone has
 POOR_RELATIVE = 0.15  # a relative displacement error above this gives a warning
 
 RULES = (
@@ -33,10 +35,13 @@ RULES = (
     f"Visualisation: among models that predict on a coarse mesh, the one with the fewest nodes at most "
     f"{100 * (NEAR - 1):.0f} % worse than the best of these. "
     f"Worst case: lowest error on its worst test run. "
+    f"The error is called regression where compression alone has less than {100 * MOSTLY_REGRESSION:.0f} % of it, and "
+    f"compression where it has more than {100 * MOSTLY_COMPRESSION:.0f} %. "
     f"A warning is given for fewer than {FEW_RUNS} test runs, a relative displacement error above "
     f"{100 * POOR_RELATIVE:.0f} %, a group of nodes whose error exceeds half of its own motion, a finer level that is "
     f"not better than the coarser one, a baseline that is better than a multi-hierarchical model, test runs outside "
     f"the range of the training runs, a 90 % band that holds less than {100 * BAND_HOLDS:.0f} %, models trained once, "
+    f"a test run whose error is more than {OUTLIER:g} times the median, "
     f"or a model that moves nodes in the first state by more than "
     f"{100 * START_SHARE:.0f} % of its mean error."
 )
@@ -192,10 +197,10 @@ def _error_source(evaluation: Evaluation) -> list[Statement]:
     floor = evaluation.floor_at(latent)
     source = (
         "Most of it is regression: more runs or a better regression would help, a larger latent size would not."
-        if s.reduction < 0.5 * s.mean
+        if s.reduction < MOSTLY_REGRESSION * s.mean
         else (
             "Most of it is compression: a larger latent size or a better reduction would help."
-            if s.reduction > 0.8 * s.mean
+            if s.reduction > MOSTLY_COMPRESSION * s.mean
             else "Compression and regression both matter."
         )
     )
@@ -347,7 +352,7 @@ def _warnings(evaluation: Evaluation) -> list[Statement]:
     out += _start(evaluation)
     out += _outside(evaluation)
     worst = evaluation.scores[best.label].of_runs
-    if count > 2 and worst.max() > 2 * np.median(worst):
+    if count > 2 and worst.max() > OUTLIER * np.median(worst):
         run = int(np.argmax(worst))
         out.append(
             Statement(

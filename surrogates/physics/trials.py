@@ -20,6 +20,7 @@ from surrogates.data.campaign import Campaign, Mirror
 from surrogates.data.inputs import over_range
 from surrogates.data.samples import LevelRuns, Notes
 from surrogates.errors import SurrogateError
+from surrogates.physics.clock import between
 from surrogates.physics.registration import Registration
 from surrogates.physics.symmetry import mirrored
 from surrogates.regression.gaussian import Gaussian, Kernel, RadialBasis
@@ -361,6 +362,4 @@ def _orthonormal(modes: NDArray[np.float32]) -> None:
 
 def _at(course: NDArray[np.float32], trained: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float32]:
     """(run, state, mode) at other times, linear."""
-    from surrogates.physics.clock import between
-
     return np.asarray(between(course.transpose(1, 0, 2), trained, time).transpose(1, 0, 2))

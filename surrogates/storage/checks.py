@@ -19,7 +19,7 @@ from surrogates.errors import SurrogateError
 from surrogates.models.base import Network
 from surrogates.models.pod_regression import PodRegression
 from surrogates.record import Record
-from surrogates.uncertainty import Band
+from surrogates.uncertainty import SHARES, Band
 
 
 def plain_files(files: Any) -> Mapping[str, str]:
@@ -116,11 +116,14 @@ def check_labels(labels: Labels | None, n_nodes: int, n_faces: int) -> None:
 
 
 def check_bands(bands: Mapping[tuple[int, bool], Band], graphs: Graphs, record: Record) -> None:
-    """One number for each node and each state."""
+    """One number for each node, each state and each share."""
     for (level, full), band in bands.items():
         name = f"band of level {level}"
         numbers(f"node of the {name}", band.node, (graphs.n_nodes(0 if full else level),))
         numbers(f"state of the {name}", band.state, (len(record.time),))
+        numbers(f"factor of the {name}", band.factor, (len(SHARES),))
+        if not (np.isfinite(band.unit) and band.unit > 0):
+            raise SurrogateError(f"{name} has the unit {band.unit}; expected a number above 0")
         if band.local is not None:
             places = len(band.local.ratio)
             numbers(f"points of the {name}", band.local.points, (places, None))

@@ -54,7 +54,10 @@ _LABELS = ("node_id", "face_part", "part_id", "face_id")
 def save(surrogate: Surrogate, folder: str | Path, *, overwrite: bool = False) -> Path:
     """Write `surrogate` as `folder`; with `overwrite` an older model there is replaced once the new one is complete.
 
-    Raises ModelFolderError if something stands there already or the place cannot be written.
+    Raises
+    ------
+    ModelFolderError
+        If something is there already or the place cannot be written.
     """
     folder = Path(folder)
     refuse_other(folder, overwrite)
@@ -80,7 +83,10 @@ def refuse_other(folder: Path, overwrite: bool) -> None:
 def load(folder: str | Path) -> Surrogate:
     """The surrogate in `folder`; needs nothing else.
 
-    Raises ModelFolderError naming the file that is missing, was altered, or does not fit.
+    Raises
+    ------
+    ModelFolderError
+        Naming the file that is missing, was altered, or does not fit.
     """
     folder = Path(folder)
     about = _about(folder)

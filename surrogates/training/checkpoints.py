@@ -29,14 +29,17 @@ _SECONDS = 30.0
 class Checkpoints:
     """A folder with one file a level: its tensors, and the rest as JSON in the file's header.
 
-    resume  go on from what is there, which must be the same training; without, the folder starts empty
-
-    Raises SurrogateError if there is nothing to resume, or it belongs to another training.
-
-    Attributes
+    Parameters
     ----------
     every
         Epochs between two files of one level; 0: about every half minute.
+    resume
+        Go on from what is there, which must be the same training; without, the folder starts empty.
+
+    Raises
+    ------
+    SurrogateError
+        If there is nothing to resume, or it belongs to another training.
     """
 
     def __init__(

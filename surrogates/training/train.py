@@ -41,11 +41,24 @@ def train_surrogate(
 ) -> Surrogate:
     """Fit the surrogate that `settings` describe to the runs of `campaign`.
 
-    report  told after every epoch
-    keeper  where the state of the training is kept between epochs, to go on from after an interruption
-
     Interrupted (KeyboardInterrupt), it returns what there is: the finished levels, and the one in training with its
-    best weights. Raises Diverged, with that surrogate on it, and SurrogateError for data nothing can be learnt from.
+    best weights.
+
+    Parameters
+    ----------
+    device
+        cpu, cuda, mps, or auto.
+    report
+        Called after every epoch.
+    keeper
+        Where the state of the training is kept between epochs, to go on from after an interruption.
+
+    Raises
+    ------
+    Diverged
+        Where a loss is not finite, with the surrogate that is left on it.
+    SurrogateError
+        For data nothing can be learnt from.
     """
     notes = Notes()
     check(campaign, settings, notes)

@@ -52,6 +52,8 @@ def ask(folder: Path) -> None:
     for number in surrogate.level_names.values():
         surrogate.predict(middle, level=number)
         surrogate.predict_full(middle, level=number)
+        if surrogate.has_band(number):
+            surrogate.band(0.9, level=number, full=True, parameters=middle)
 
 
 def ask_or_refuse(folder: Path) -> None:
@@ -88,6 +90,16 @@ def test_an_index_or_number_out_of_range_is_named(
 
     with pytest.raises(ModelFolderError, match=said):
         load(altered(stored, tmp_path / "m", "graphs.safetensors", change))
+
+
+@pytest.mark.parametrize(("name", "said"), [("factor", "factor of the band"), ("unit", "unit 0.0; expected")])
+def test_a_band_that_lacks_quantiles_or_a_unit_is_refused(stored: Path, tmp_path: Path, name: str, said: str) -> None:
+    def change(tensors: dict[str, torch.Tensor]) -> None:
+        key = next(key for key in tensors if key.endswith(f".{name}"))
+        tensors[key] = tensors[key][:-1].clone() if name == "factor" else torch.zeros_like(tensors[key])
+
+    with pytest.raises(ModelFolderError, match=said):
+        load(altered(stored, tmp_path / "m", "bands.safetensors", change))
 
 
 def _deep() -> Any:
