@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-# Any query is near to so many average runs: far from all others the ratio goes to the mean.
-_PRIOR = 1.0
+# Any query is near to one average run: far from all others the ratio goes to the mean.
 # A run, or the surroundings of a query, is said to be hard from this many times the typical error on.
 HARD = 2.0
 # A run is near a query up to so many widths.
-_NEAR = 2.0
+REACH = 2.0
 
 
 @dataclass(frozen=True)
@@ -81,11 +80,16 @@ class LocalErrors:
         weight = np.exp(-0.5 * np.square(cdist(points, self.points) / self.width))
         if run is not None:
             weight[run[:, None] == self.run] = 0.0
-        return np.asarray((weight @ self.ratio + _PRIOR * self.ratio.mean()) / (weight.sum(axis=1) + _PRIOR))
+        return np.asarray((weight @ self.ratio + self.prior) / (weight.sum(axis=1) + 1))
+
+    @property
+    def prior(self) -> float:
+        """What any query is told besides: one average run."""
+        return float(self.ratio.mean())
 
     def hard_runs(self, point: NDArray[np.float64]) -> NDArray[np.int64]:
         """Numbers of the runs near a point (parameter,) that were predicted far worse than expected, the worst first."""
-        near = cdist(point[None], self.points)[0] <= _NEAR * self.width
+        near = cdist(point[None], self.points)[0] <= REACH * self.width
         places = np.flatnonzero(near & (self.ratio > HARD))
         found = self.run[places[np.argsort(-self.ratio[places], kind="stable")]]
         return found[np.sort(np.unique(found, return_index=True)[1])]

@@ -49,27 +49,58 @@ function makeModel(spec, arrays, mesh) {
     const known = spec.bands[level === 0 ? spec.levels[0].number : level];
     if (!known) return null;
     const [at] = [time], node = arrays[known.node], state = arrays[known.state], times = arrays[known.time];
-    let scale = known.factor * interpolate(times, state, at);
-    if (known.deviation && core.deviation) scale *= core.deviation(remembered.get(registration.inputs(values(parameters)).join())) / known.deviation;
+    const scale = interpolate(times, state, at) * spread(values(parameters), known) / known.unit;
     return Float32Array.from(node, (v) => v * scale);
   }
 
-  // What is said of a query: parameters beyond the trained ranges, and distance to the nearest training run.
+  // How wide the band of a query is: see surrogates/uncertainty.py.
+  function spread(p, known) {
+    if (known.spread === 'constant') return 1;
+    const size = registration.clock(p, 0)[1];
+    if (known.spread === 'size') return size;
+    const expected = size * Math.sqrt(core.deviation ? core.deviation(registration.inputs(p)) : 1);
+    return known.spread === 'local' ? expected * localErrors(known.local, place(p)) : expected;
+  }
+
+  // Where a query lies in the trained range, in [-1, 1].
+  function place(p) {
+    const out = [];
+    spec.parameters.forEach((q, k) => { if (q.high > q.low) out.push(2 * (p[k] - q.low) / (q.high - q.low) - 1); });
+    return out;
+  }
+
+  // What is said of a query: parameters beyond the trained ranges, and runs near it that were predicted badly.
   function warnings(parameters) {
     const out = [];
     for (const p of spec.parameters) {
       const v = parameters[p.name], slack = 1e-9 * Math.max(Math.abs(p.low), Math.abs(p.high));
-      if (v < p.low - slack || v > p.high + slack) out.push(`${p.label} is outside the trained range`);
+      if (v < p.low - slack || v > p.high + slack) out.push(`${p.label} is outside the trained range: do not rely on what is shown`);
     }
     const query = values(parameters);
-    for (const fold of spec.folds || []) {
-      const away = Math.hypot(...spec.parameters.map((p, k) => (query[k] - fold.at[k]) / ((p.high - p.low) || 1)));
-      if (away < fold.reach) { out.push(fold.sentence); break; }
+    if (spec.hard) {
+      const point = place(query), times = localErrors(spec.hard, point);
+      const near = spec.hard.run.map((run, k) => [run, spec.hard.ratio[k], distance(point, spec.hard.points[k])])
+        .filter(([, ratio, away]) => ratio > spec.hard.limit && away <= spec.hard.reach * spec.hard.width)
+        .sort((a, b) => b[1] - a[1]).map(([run]) => run);
+      const named = [...new Set(near)].slice(0, 3).map((run) => `${spec.hard.runs[run][0]} (${(100 * spec.hard.runs[run][1]).toPrecision(2)} cm)`);
+      if (times >= spec.hard.limit && named.length) out.push(`near a fold: the model was wrong about ${named.join(', ')} when left out; expect ${times.toFixed(1)} times the typical error`);
     }
     return out;
   }
 
   return {spec, predict, full, band, warnings};
+}
+
+function distance(a, b) { return Math.hypot(...a.map((v, k) => v - b[k])); }
+
+// How many times the typical error to expect at a point; see surrogates/local_errors.py.
+function localErrors(told, point) {
+  let sum = told.prior, weights = 1;
+  told.points.forEach((other, k) => {
+    const w = Math.exp(-0.5 * (distance(point, other) / told.width) ** 2);
+    sum += w * told.ratio[k]; weights += w;
+  });
+  return sum / weights;
 }
 
 // Derived inputs, clock and size; see surrogates/physics.
@@ -93,13 +124,16 @@ function makeRegistration(told, parameters) {
 
 // A Gaussian process over whole courses of POD coefficients: coefficients = mean + k(x) pull, states = modes coefficients.
 function makeProcess(spec, arrays) {
-  const {x, mix, mean, pull, modes, grid, low, high} = Object.fromEntries(
-    ['x', 'mix', 'mean', 'pull', 'modes', 'grid', 'low', 'high'].map((name) => [name, arrays[spec.arrays[name]]]));
-  const {variance, slope} = spec.kernel, r = spec.modes, samples = spec.samples, kept = spec.kept;
-  function prepare(inputs) {
+  const {x, mix, mean, pull, modes, grid, low, high, inverse} = Object.fromEntries(
+    ['x', 'mix', 'mean', 'pull', 'modes', 'grid', 'low', 'high', 'inverse'].map((name) => [name, arrays[spec.arrays[name]]]));
+  const {variance, slope, noise} = spec.kernel, r = spec.modes, samples = spec.samples, kept = spec.kept;
+  function scaled(inputs) {
     const q = [];
     inputs.forEach((v, k) => { if (kept[k]) q.push(2 * (v - low[k]) / (high[k] - low[k]) - 1); });
-    const d = q.length, course = Float64Array.from(mean);
+    return q;
+  }
+  function covariances(q) {
+    const d = q.length, out = new Float64Array(samples);
     for (let i = 0; i < samples; i++) {
       let away = 0, dot = 0;
       for (let a = 0; a < d; a++) {
@@ -107,10 +141,29 @@ function makeProcess(spec, arrays) {
         for (let b = 0; b <= a; b++) s += mix[a * d + b] * (q[b] - x[i * d + b]);
         away += s * s; dot += q[a] * x[i * d + a];
       }
-      const m = Math.sqrt(3 * away), k = variance * (1 + m) * Math.exp(-m) + slope * dot, from = i * course.length;
-      for (let j = 0; j < course.length; j++) course[j] += k * pull[from + j];
+      const m = Math.sqrt(3 * away);
+      out[i] = variance * (1 + m) * Math.exp(-m) + slope * dot;
     }
+    return out;
+  }
+  function prepare(inputs) {
+    const course = Float64Array.from(mean);
+    covariances(scaled(inputs)).forEach((k, i) => {
+      const from = i * course.length;
+      for (let j = 0; j < course.length; j++) course[j] += k * pull[from + j];
+    });
     return course;
+  }
+  function deviation(inputs) {  // what the process believes its standard deviation to be, in units of the outputs' spread
+    const q = scaled(inputs), k = covariances(q);
+    let own = variance, gain = 0, sum = 0, ones = 0;
+    for (const v of q) own += slope * v * v;
+    for (let i = 0; i < samples; i++) {
+      let row = 0, all = 0;
+      for (let j = 0; j < samples; j++) { row += inverse[i * samples + j] * k[j]; all += inverse[i * samples + j]; }
+      gain += k[i] * row; sum += row; ones += all;
+    }
+    return Math.sqrt(Math.max(own - gain + (1 - sum) ** 2 / ones, 0) + noise);
   }
   function state(course, time) {
     const c = new Float64Array(r), n = modes.length / r, out = new Float32Array(n);
@@ -118,7 +171,7 @@ function makeProcess(spec, arrays) {
     for (let i = 0; i < n; i++) { let s = 0; for (let k = 0; k < r; k++) s += modes[i * r + k] * c[k]; out[i] = s; }
     return out;
   }
-  return {prepare, state};
+  return {prepare, state, deviation};
 }
 
 // The monotone cubic of Fritsch and Butland through value(0), value(1), .. at `grid`; the ends are held outside.

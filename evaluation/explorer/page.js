@@ -12,13 +12,18 @@
   const state = {parameters: {}, time: 0};
 
   // For programs: displacements, m, xyz node by node; parameters in the dataset's units, time in s, level 0: the full mesh.
+  function named(name) {
+    const chosen = name === undefined ? models[0] : models.find((m) => m.spec.name === name);
+    if (!chosen) throw new Error(`no model is called ${name}; there are ${bundle.models.map((m) => m.name).join(', ')}`);
+    return chosen;
+  }
   window.crashkit = {
     models: bundle.models.map((m) => m.name),
     predict: async (parameters, time, level = 0, name = undefined) => {
-      const chosen = name === undefined ? models[0] : models.find((m) => m.spec.name === name);
-      if (!chosen) throw new Error(`no model is called ${name}; there are ${bundle.models.map((m) => m.name).join(', ')}`);
-      return chosen.predict(parameters, time, level);
+      return named(name).predict(parameters, time, level);
     },
+    band: async (parameters, time, level = 0, name = undefined) => named(name).band(parameters, time, level),
+    warnings: async (parameters, name = undefined) => named(name).warnings(parameters),
   };
 
   get('about').textContent = bundle.about;
@@ -99,7 +104,7 @@
     const band = model.band(state.parameters, state.time, level());
     now = {u, other, band};
     const said = model.warnings(state.parameters);
-    get('warnings').textContent = said.length ? said.join('; ') + ': do not rely on what is shown.' : '';
+    get('warnings').textContent = said.length ? said.join('; ') + '.' : '';
     get('now').textContent = `${(1e3 * state.time).toFixed(1)} ms`;
     numbers();
     curves();

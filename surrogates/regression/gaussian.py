@@ -117,6 +117,12 @@ class Gaussian:
         mean = ones @ y / ones.sum()
         return mean, cho_solve(factor, y - mean)
 
+    def inverse(self) -> NDArray[np.float64]:
+        """(sample, sample): inverse of the covariance of the samples, noise included."""
+        from scipy.linalg import cho_solve
+
+        return np.asarray(cho_solve(self._factor(), np.eye(len(self.x))))
+
     def deviation(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """(query,): what the process believes its standard deviation to be, in units of the outputs' spread."""
         if not self._informed:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogates.errors import SurrogateError
+from surrogates.local_errors import HARD, REACH, LocalErrors
 from surrogates.models.cascade import Cascade
 from surrogates.models.pod_regression import PodRegression
 from surrogates.regression.gaussian import Gaussian
@@ -53,7 +54,7 @@ def browsable(surrogate: Surrogate, name: str, prefix: str, share: float = 0.9) 
     quantised: set[str] = set()
     about: dict[str, Any] = {
         "name": name, "time": surrogate.record.time.tolist(), "registration": _registration(surrogate),
-        "levels": _levels(surrogate, arrays, prefix), "bands": _bands(surrogate, arrays, prefix, share), "folds": [],
+        "levels": _levels(surrogate, arrays, prefix), "bands": _bands(surrogate, arrays, prefix, share), "hard": _hard(surrogate),
     }  # fmt: skip
     if isinstance(core, PodRegression):
         about |= _process(core, arrays, quantised, prefix)
@@ -71,9 +72,10 @@ def _process(core: PodRegression, arrays: dict[str, NDArray[Any]], quantised: se
         raise SurrogateError("only Gaussian processes over whole runs have a form for a browser; train pod-gpr or mh")
     known = core.data.values.reshape(len(core.data.values), -1).astype(np.float64)
     mean, pull = core.machine.expanded(known)
+    inverse = core.machine.inverse()
     named = {
         "x": core.machine.x, "mix": core.machine.kernel.mix, "mean": mean, "pull": pull, "modes": core.modes,
-        "grid": core.data.time, "low": core.low, "high": core.high,
+        "grid": core.data.time, "low": core.low, "high": core.high, "inverse": inverse,
     }  # fmt: skip
     for key, values in named.items():
         arrays[prefix + key] = np.asarray(values, np.float32 if key == "modes" else np.float64)
@@ -81,7 +83,7 @@ def _process(core: PodRegression, arrays: dict[str, NDArray[Any]], quantised: se
     kernel = core.machine.kernel
     return {
         "kind": "process", "arrays": {key: prefix + key for key in named},
-        "kernel": {"variance": float(kernel.variance), "slope": float(kernel.slope)},
+        "kernel": {"variance": float(kernel.variance), "slope": float(kernel.slope), "noise": float(kernel.noise)},
         "modes": core.modes.shape[1], "samples": len(core.machine.x), "kept": (core.high > core.low).tolist(),
     }  # fmt: skip
 
@@ -121,5 +123,26 @@ def _bands(surrogate: Surrogate, arrays: dict[str, NDArray[Any]], prefix: str, s
         arrays[names["node"]] = largest.astype(np.float32)
         arrays[names["state"]] = (width[:, place] / max(float(largest[place]), 1e-12)).astype(np.float64)
         arrays[names["time"]] = surrogate.record.time.astype(np.float64)
-        out[str(number)] = {**names, "factor": 1.0}
+        band = surrogate.bands[number, number > 0]
+        out[str(number)] = {
+            **names, "spread": band.spread, "unit": band.unit,
+            "local": None if band.local is None else _local(band.local),
+        }  # fmt: skip
     return out
+
+
+def _local(local: LocalErrors) -> dict[str, Any]:
+    return {
+        "points": local.points.tolist(), "ratio": local.ratio.tolist(), "width": local.width, "prior": local.prior,
+    }  # fmt: skip
+
+
+def _hard(surrogate: Surrogate) -> dict[str, Any] | None:
+    """Where runs were predicted badly when left out: as `Surrogate.hard` says it."""
+    local = surrogate.local_errors()
+    if local is None:
+        return None
+    return {
+        **_local(local), "run": local.run.tolist(), "limit": HARD, "reach": REACH,
+        "runs": [[name, error] for name, (error, _) in surrogate.record.left_out.items()],
+    }  # fmt: skip

@@ -88,3 +88,16 @@ def campaign(runs: int = 10, *, seed: int = 0, **changes: object) -> Campaign:
         "faces": quads(SIDES[0]).astype(np.int32),
     }
     return Campaign(**{**values, **changes})  # type: ignore[arg-type]
+
+
+def folding(runs: int = 40) -> Campaign:
+    """Runs whose dent also goes to one side or the other, at random, where the angle is below three degrees."""
+    mu = parameters(runs)
+    u = displacement(mu)
+    side = np.where(np.arange(runs) % 2 == 0, 1.0, -1.0) * (np.abs(mu[:, 1]) < 3.0)
+    u[..., 1] += (side[:, None, None] * np.abs(u[..., 2])).astype(np.float32)
+    return campaign(runs, displacement=lambda level: u)
+
+
+# Settings of a process that takes a folding plate as it is, without the physics that would be tried first.
+PLAIN_PROCESS = ("pod.modes=[6]", "inputs.derived=off", "physics.clock=off", "physics.symmetry=off")

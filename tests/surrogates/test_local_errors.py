@@ -111,16 +111,7 @@ def test_errors_without_a_pattern_or_of_few_runs_leave_the_band_as_it_was() -> N
 @pytest.fixture(scope="module")
 def folding() -> Surrogate:
     """A plate whose dent goes to one side or the other where the angle is small, as a rail folds."""
-    mu = plate.parameters(40)
-    u = plate.displacement(mu)
-    side = np.where(np.arange(40) % 2 == 0, 1.0, -1.0) * (np.abs(mu[:, 1]) < 3.0)
-    u[..., 1] += (side[:, None, None] * np.abs(u[..., 2])).astype(np.float32)
-    return train_surrogate(
-        plate.campaign(40, displacement=lambda level: u),
-        choose(
-            "pod-gpr", overrides=("pod.modes=[6]", "inputs.derived=off", "physics.clock=off", "physics.symmetry=off")
-        ),
-    )
+    return train_surrogate(plate.folding(), choose("pod-gpr", overrides=plate.PLAIN_PROCESS))
 
 
 def test_a_query_at_the_fold_is_told_and_gets_the_wider_band(folding: Surrogate) -> None:

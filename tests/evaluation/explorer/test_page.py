@@ -91,6 +91,34 @@ def test_twenty_predictions_of_every_model_and_level_are_those_of_python(
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium or Chrome is installed")
+def test_band_and_warnings_are_those_of_python(models: dict[str, tuple[Path, Surrogate]], tmp_path: Path) -> None:
+    folds = train_surrogate(plate.folding(), settings("pod-gpr", overrides=plate.PLAIN_PROCESS))
+    save(folds, tmp_path / "folds")
+    page = explore([models["mh"][0], models["pod-gpr"][0], tmp_path / "folds"], tmp_path / "crash.html")
+    found = in_browser(
+        page,
+        """
+        const out = [];
+        for (const name of crashkit.models) for (const angle of [0.5, 8]) {
+          const query = {impact_speed: 22, impact_angle: angle, yield_stress: 3e8};
+          out.push([Math.max(...await crashkit.band(query, 0.02, 0, name)), await crashkit.warnings(query, name)]);
+        }
+        return out;
+        """,
+    )
+    assert isinstance(found, list)
+    asked = [(s, [22.0, angle, 3e8]) for s in (models["mh"][1], models["pod-gpr"][1], folds) for angle in (0.5, 8.0)]
+    for (width, said), (surrogate, query) in zip(found, asked, strict=True):
+        expected = surrogate.band(0.9, [0.02], full=True, parameters=query).max()
+        assert width == pytest.approx(float(expected), rel=1e-3)
+        assert [s.removesuffix(", or compute a run") for s in surrogate.hard(query)] == [
+            s for s in said if "outside" not in s
+        ]
+    assert folds.bands[0, False].spread == "local"
+    assert ["fold" in " ".join(said) for _, said in found] == [False, False, False, False, True, False]
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium or Chrome is installed")
 def test_sliders_levels_and_holding_work_and_what_is_outside_is_said(
     models: dict[str, tuple[Path, Surrogate]], tmp_path: Path
 ) -> None:
