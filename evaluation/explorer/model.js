@@ -83,7 +83,7 @@ function makeModel(spec, arrays, mesh) {
         .filter(([, ratio, away]) => ratio > spec.hard.limit && away <= spec.hard.reach * spec.hard.width)
         .sort((a, b) => b[1] - a[1]).map(([run]) => run);
       const named = [...new Set(near)].slice(0, 3).map((run) => `${spec.hard.runs[run][0]} (${(100 * spec.hard.runs[run][1]).toPrecision(2)} cm)`);
-      if (times >= spec.hard.limit && named.length) out.push(`near a fold: the model was wrong about ${named.join(', ')} when left out; expect ${times.toFixed(1)} times the typical error`);
+      if (times >= spec.hard.limit && named.length) out.push(`near a fold: the model was wrong about ${named.join(', ')} when left out; expect ${times.toFixed(1)} times the typical error here`);
     }
     return out;
   }
