@@ -176,7 +176,7 @@ def _flags(view: RunView, place: int) -> Callable[[int, int], NDArray[Any]]:
 
 
 def _the_run(path: Path, wanted: str | int | None, runs: Iterator[Run]) -> Run:
-    """The run asked for by name or place; without a wish the only one."""
+    """The run asked for by name or place; without either, the only one."""
     if not isinstance(runs, Runs):
         opened = list(runs)
         runs = Runs({run.name: partial(_itself, run) for run in opened})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import numpy as np
@@ -11,8 +11,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashkit.campaign.box import Box
-
-Method = Literal["expected-reduction", "halton", "sobol", "random"]
+    from crashkit.campaign.plan import Method
 
 
 def propose(
@@ -56,6 +55,7 @@ def propose(
     import pandas as pd
 
     from crashkit.campaign.box import Box, CampaignError, read_box
+    from crashkit.campaign.plan import sequence
     from surrogates.design.space import fill
 
     if count < 1:
@@ -69,7 +69,7 @@ def propose(
     if dataset is None or method != "expected-reduction":
         points = fill(
             box.low, box.high, count, seed=seed, allowed=box.allowed, edges=dataset is None,
-            sequence="halton" if method == "expected-reduction" else method,
+            sequence=sequence(method),
         )  # fmt: skip
         about: dict[str, float] = {}
     else:

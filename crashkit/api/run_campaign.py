@@ -1,4 +1,4 @@
-"""From a campaign file to computed runs, a dataset, a surrogate and its judged error: the loop until a wish is met."""
+"""From a campaign file to computed runs, a dataset, a surrogate and its judged error: the loop until the error is small enough."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class CampaignSummary:
 
 
 def run_campaign(
-    study: str | Path,
+    plan: str | Path,
     folder: str | Path | None = None,
     *,
     until: str | None = None,
@@ -61,14 +61,14 @@ def run_campaign(
     report: Progress | None = None,
     say: Say | None = None,
 ) -> CampaignSummary:
-    """Compute the runs of a campaign, and go on until its wish is met.
+    """Compute the runs of a campaign, and go on until the error over the box is small enough.
 
     Parameters
     ----------
-    study
-        The campaign file (`crashkit.campaign.study.Study`).
+    plan
+        The campaign file (`crashkit.campaign.plan.Plan`).
     folder
-        Where everything is kept; default: beside the file, called as it.
+        Where everything is kept; default: beside the file, with its name.
     until, confidence
         An error over the box such as "8 mm", and with which confidence it must be below; default: what the file says.
         Without any, the first runs are computed and made a dataset, and that is all.
@@ -97,21 +97,23 @@ def run_campaign(
     from crashkit.extras import need
 
     need("running a campaign", "campaign")
-    if os.name == "nt":
-        from crashkit.campaign.box import CampaignError
+    from crashkit.campaign.box import CampaignError
 
+    if os.name == "nt":
         raise CampaignError(
             "campaigns need Linux or macOS, for their locks and to end a solver with all it started; on Windows use WSL"
         )
+    if confidence is not None and not 0.5 < confidence < 1:
+        raise CampaignError(f"a confidence of {confidence:g} was asked for; expected between 0.5 and 1, such as 0.9")
     from crashkit.campaign.campaign import Campaign
+    from crashkit.campaign.plan import length_of
     from crashkit.campaign.status import write_page
-    from crashkit.campaign.study import length_of
 
     speak = say or (lambda sentence: None)
-    with Campaign(study, folder, executor) as campaign:
-        wish = length_of(until) if until else campaign.study.wish()
-        share = confidence or campaign.study.confidence
-        limit = most_runs or campaign.study.most_runs
+    with Campaign(plan, folder, executor) as campaign:
+        target = length_of(until) if until else campaign.plan.target()
+        share = confidence or campaign.plan.confidence
+        limit = most_runs or campaign.plan.most_runs
         if retry:
             campaign.retry()
         if not campaign.table.runs():
@@ -123,14 +125,14 @@ def run_campaign(
             counts = {s: len(campaign.table.runs(s)) for s in ("done", "failed", "refused")}
             speak(f"{counts['done']} runs done, {counts['failed']} failed, {counts['refused']} refused")
             judged: Judgement | None = None
-            if wish is None:
+            if target is None:
                 why = "the runs of the campaign are computed; no error was asked for"
                 break
             if counts["done"] < _FEWEST:
                 if not added:
                     why = f"only {counts['done']} runs ended well; {_FEWEST} are needed to judge anything"
                     break
-                campaign.add(_filling(campaign, campaign.study.design.batch), "filling")
+                campaign.add(_filling(campaign, campaign.plan.design.batch), "filling")
                 continue
             judged, after, points = _train_and_judge(campaign, share)
             solver = sum(r.seconds or 0.0 for r in campaign.table.runs())
@@ -147,7 +149,7 @@ def run_campaign(
                 f"{1e3 * judged.low:.2f} to {1e3 * judged.high:.2f}); the next batch is expected to bring "
                 f"{1e3 * (judged.error - after):.2f} mm; {solver / 60:.1f} min of solver time so far"
             )
-            stop = _why_stop(campaign, judged, after, wish, limit, counts["done"], started)
+            stop = _why_stop(campaign, judged, after, target, limit, counts["done"], started)
             if stop:
                 why = stop
                 break
@@ -169,43 +171,43 @@ def _train_and_judge(campaign: Campaign, confidence: float) -> tuple[Judgement, 
     from crashkit.api._design import Known
     from crashkit.api.train import train
 
-    study = campaign.study
-    odd = [n for n, r in study.parameters.items() if r.odd]
+    plan = campaign.plan
+    odd = [n for n, r in plan.parameters.items() if r.odd]
     told = [f"physics.odd=[{', '.join(odd)}]"] if odd else []
     surrogate = train(
-        campaign.dataset, campaign.folder / "process", "pod-gpr", settings=told, seed=study.design.seed,
+        campaign.dataset, campaign.folder / "process", "pod-gpr", settings=told, seed=plan.design.seed,
         overwrite=True,
     ).surrogate  # fmt: skip
-    known = Known.of(surrogate, study)
-    judged = known.judge(confidence, study.design.seed)
+    known = Known.of(surrogate, plan)
+    judged = known.judge(confidence, plan.design.seed)
     computed = campaign.points("done")
-    seed = study.design.seed + 1000 * len(computed)
-    if study.design.method == "expected-reduction":
-        points, share = known.best(known.parameters(computed), study.design.batch, seed)
+    seed = plan.design.seed + 1000 * len(computed)
+    if plan.design.method == "expected-reduction":
+        points, share = known.best(known.parameters(computed), plan.design.batch, seed)
     else:
-        points = _filling(campaign, study.design.batch)
+        points = _filling(campaign, plan.design.batch)
         share = known.fall(known.parameters(computed), known.parameters(points), seed)
     return judged, judged.error * share, points
 
 
 def _why_stop(
-    campaign: Campaign, judged: Judgement, after: float, wish: float, limit: int, runs: int, started: float
+    campaign: Campaign, judged: Judgement, after: float, target: float, limit: int, runs: int, started: float
 ) -> str | None:
     """Why the campaign ends here; None where it goes on."""
-    study = campaign.study
-    if judged.below(wish):
+    plan = campaign.plan
+    if judged.below(target):
         return (
-            f"the error is below {1e3 * wish:g} mm with a confidence of {100 * judged.confidence:.0f} %: "
+            f"the error is below {1e3 * target:g} mm with a confidence of {100 * judged.confidence:.0f} %: "
             f"{1e3 * judged.error:.2f} mm with {runs} runs"
         )
     if runs >= limit:
         return f"{runs} runs are computed, the most that were allowed; the error is {1e3 * judged.error:.2f} mm"
     hours = (time.monotonic() - started) / 3600
-    if study.most_hours is not None and hours >= study.most_hours:
+    if plan.most_hours is not None and hours >= plan.most_hours:
         return f"{hours:.1f} hours are used up; the error is {1e3 * judged.error:.2f} mm"
-    if judged.error - after < study.least_gain * judged.error:
+    if judged.error - after < plan.least_gain * judged.error:
         return (
-            f"another {study.design.batch} runs would gain less than {100 * study.least_gain:g} % of the error, which is "
+            f"another {plan.design.batch} runs would gain less than {100 * plan.least_gain:g} % of the error, which is "
             f"{1e3 * judged.error:.2f} mm"
         )
     return None
@@ -217,37 +219,33 @@ def _train_wanted(campaign: Campaign) -> Path | None:
     from crashkit.api.train import train
     from crashkit.mesh.store import has_hierarchy
 
-    study, folder = campaign.study, campaign.folder / "model"
-    if study.model == "pod-gpr" and not study.settings:
+    plan, folder = campaign.plan, campaign.folder / "model"
+    if plan.model == "pod-gpr" and not plan.settings:
         return campaign.folder / "process"
-    if study.nodes and not has_hierarchy(campaign.dataset):
-        coarsen(campaign.dataset, nodes=list(study.nodes))
-    train(
-        campaign.dataset, folder, study.model, settings=[f"{k}={v}" for k, v in study.settings.items()], overwrite=True
-    )
+    if plan.nodes and not has_hierarchy(campaign.dataset):
+        coarsen(campaign.dataset, nodes=list(plan.nodes))
+    train(campaign.dataset, folder, plan.model, settings=[f"{k}={v}" for k, v in plan.settings.items()], overwrite=True)
     return folder
 
 
 def _first_points(campaign: Campaign) -> NDArray[np.float64]:
-    from surrogates.design.space import fill
-
-    study = campaign.study
-    sequence = "halton" if study.design.method == "expected-reduction" else study.design.method
-    return fill(
-        study.low, study.high, study.design.start, seed=study.design.seed, allowed=study.allowed, edges=True,
-        sequence=sequence,
-    )  # fmt: skip
+    return _fill(campaign, campaign.plan.design.start, edges=True)
 
 
 def _filling(campaign: Campaign, count: int) -> NDArray[np.float64]:
     """The next points of the sequence that the campaign began with."""
+    return _fill(campaign, count, skip=len(campaign.table.runs()))
+
+
+def _fill(campaign: Campaign, count: int, *, edges: bool = False, skip: int = 0) -> NDArray[np.float64]:
+    from crashkit.campaign.plan import sequence
     from surrogates.design.space import fill
 
-    study, known = campaign.study, len(campaign.table.runs())
-    sequence = "halton" if study.design.method == "expected-reduction" else study.design.method
+    plan = campaign.plan
     return fill(
-        study.low, study.high, count, seed=study.design.seed, allowed=study.allowed, skip=known, sequence=sequence
-    )
+        plan.low, plan.high, count, seed=plan.design.seed, allowed=plan.allowed, edges=edges, skip=skip,
+        sequence=sequence(plan.design.method),
+    )  # fmt: skip
 
 
 def _compute(campaign: Campaign, report: Progress | None) -> None:
@@ -284,7 +282,7 @@ def _ingest(campaign: Campaign) -> int:
     ]
     if not new:
         return 0
-    told = campaign.study.ingest
+    told = campaign.plan.ingest
     ingest(
         new, campaign.dataset, params=campaign.write_parameters(), units=told.units, reader=told.reader,
         parts=told.parts, exclude_parts=told.exclude_parts, fields=told.fields, time=told.time,

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from crashkit.errors import DataError, ReadError
+from crashkit.yaml_file import checked, read_yaml
 
 KINDS = ("mh", "podnn", "aenn", "gaenn", "pod-gpr", "pod-rbf")
 Positive = Annotated[int, Field(ge=1)]
@@ -117,45 +116,6 @@ def read_study(path: str | Path) -> Study:
     ReadError
         Where there is no such file, or it is no YAML, with the line.
     DataError
-        Where a key is unknown or a value not understood, naming it and what was expected.
+        Where a name is not known or a value does not fit, naming it and what was expected.
     """
-    import yaml
-
-    path = Path(path)
-    if not path.is_file():
-        raise ReadError(f"{path}: no such file; expected a study in YAML, such as the one crashkit run --help shows")
-    try:
-        given = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise ReadError(f"{path}: cannot be read as YAML ({' '.join(str(error).split())[:160]})") from error
-    if not isinstance(given, dict):
-        raise DataError(f"{path}: holds no keys; expected ingest, coarsen, train and evaluate")
-    try:
-        return Study.model_validate(given)
-    except ValidationError as error:
-        raise DataError(f"{path}: {_said(error)}") from error
-
-
-def _said(error: ValidationError) -> str:
-    """The first thing wrong, in words, with its place in the file."""
-    first = error.errors()[0]
-    place = ".".join(str(p) for p in first["loc"] if p not in ("function-after[_named(), TrainStep]",))
-    if first["type"] == "extra_forbidden":
-        known = _known(first["loc"][:-1])
-        near = difflib.get_close_matches(str(first["loc"][-1]), known, 1)
-        return f"{place} is not known" + (f"; did you mean {near[0]}?" if near else f"; known are {', '.join(known)}")
-    text = first["msg"].removeprefix("Value error, ")
-    found = f", found {first['input']!r}" if not isinstance(first["input"], (dict, BaseModel)) else ""
-    return f"{place}: {text}{found}" if place else text
-
-
-def _known(place: tuple[Any, ...]) -> list[str]:
-    """The keys that may stand at a place."""
-    sections: dict[str, type[BaseModel]] = {
-        "ingest": IngestStep, "coarsen": CoarsenStep, "train": TrainStep, "evaluate": EvaluateStep,
-    }  # fmt: skip
-    if not place:
-        return list(Study.model_fields)
-    if "models" in place:
-        return list(ModelStep.model_fields)
-    return list(sections[str(place[0])].model_fields) if str(place[0]) in sections else []
+    return checked(Study, read_yaml(path, "a study with ingest or dataset, coarsen, train and evaluate"), path)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from crashkit.errors import CrashkitError
+from crashkit.yaml_file import checked, read_yaml
 
 
 class CampaignError(CrashkitError):
@@ -125,40 +125,10 @@ def read_box(path: str | Path) -> Box:
 
     Raises
     ------
-    CampaignError
+    CrashkitError
         Where the file cannot be read or says something else.
     """
-    box: Box = checked(Box, {k: v for k, v in read_yaml(path).items() if k in ("parameters", "constraints")}, path)
-    return box
-
-
-def read_yaml(path: str | Path) -> dict[str, Any]:
-    """A YAML file that holds names and values. Raises CampaignError."""
-    import yaml
-
-    path = Path(path)
-    try:
-        found = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise CampaignError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise CampaignError(f"{path}: is no YAML ({' '.join(str(error).split())[:160]})") from error
-    if not isinstance(found, dict):
-        raise CampaignError(
-            f"{path}: expected names with values, such as 'parameters: ...'; found {type(found).__name__}"
-        )
-    return found
-
-
-def checked(kind: type[Any], values: Mapping[str, Any], path: str | Path) -> Any:
-    """`values` as an object of `kind`; raises CampaignError that names the first place that does not fit."""
-    try:
-        return kind(**values)
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(p) for p in first["loc"]) or "file"
-        message = first["msg"].removeprefix("Value error, ")
-        if first["type"] == "extra_forbidden":
-            known = ", ".join(kind.model_fields)
-            message = f"is not known; the file may say {known}"
-        raise CampaignError(f"{path}: {place}: {message}") from error
+    found = read_yaml(
+        path, "parameters with bounds, such as 'parameters: {impact_speed: {low: 5, high: 35, unit: m/s}}'"
+    )
+    return checked(Box, {k: v for k, v in found.items() if k in Box.model_fields}, path)

@@ -29,7 +29,7 @@ from crashkit.campaign import job
 from crashkit.campaign.box import CampaignError
 from crashkit.campaign.deck import arguments, check_template, program_of, template_files, write_deck
 from crashkit.campaign.executors import Executor, Local, Slurm
-from crashkit.campaign.study import Study, read_study
+from crashkit.campaign.plan import Plan, read_plan
 from crashkit.campaign.table import Run, Table
 from data_schema.progress import Progress, silent
 from data_schema.replace import beside
@@ -41,25 +41,25 @@ _LOCK = ".lock"
 
 
 class Campaign:
-    """The campaign of `study_file` in `folder`; a context manager, since one process at a time may run it.
+    """The campaign of `plan_file` in `folder`; a context manager, since one process at a time may run it.
 
     Raises CampaignError where another campaign or another process has the folder, or what the file names is not there.
     """
 
     def __init__(
-        self, study_file: str | Path, folder: str | Path | None = None, executor: Executor | None = None
+        self, plan_file: str | Path, folder: str | Path | None = None, executor: Executor | None = None
     ) -> None:
-        self.file = Path(study_file)
-        self.study: Study = read_study(self.file)
+        self.file = Path(plan_file)
+        self.plan: Plan = read_plan(self.file)
         self.home = self.file.resolve().parent
         self.folder = Path(folder) if folder is not None else self.home / self.file.stem
-        study = self.study
-        self._templates = template_files(self.home, study.template)
-        self._files = template_files(self.home, study.files)
+        plan = self.plan
+        self._templates = template_files(self.home, plan.template)
+        self._files = template_files(self.home, plan.files)
         for template in self._templates:
-            check_template(template, study.names)
-        trial = self._values(dict(zip(study.names, study.low.tolist(), strict=True)), "run_000")
-        for command in filter(None, (study.prepare, study.command)):
+            check_template(template, plan.names)
+        trial = self._values(dict(zip(plan.names, plan.low.tolist(), strict=True)), "run_000")
+        for command in filter(None, (plan.prepare, plan.command)):
             arguments(command, trial)
             program_of(command, self.home)
         try:
@@ -80,7 +80,7 @@ class Campaign:
             undo.callback(self.table.close)
             self._claim()
             self.executor = executor or (
-                Slurm(self.folder, study.slurm, study.timeout) if study.executor == "slurm" else Local()
+                Slurm(self.folder, plan.slurm, plan.timeout) if plan.executor == "slurm" else Local()
             )
             undo.pop_all()
 
@@ -97,15 +97,15 @@ class Campaign:
 
     def points(self, *states: str) -> NDArray[np.float64]:
         """Parameters (run, parameter) of the runs in `states` (all without), in the units of the box."""
-        rows = [[r.parameters[n] for n in self.study.names] for r in self.table.runs(*states)]
-        return np.array(rows, np.float64).reshape(-1, len(self.study.names))
+        rows = [[r.parameters[n] for n in self.plan.names] for r in self.table.runs(*states)]
+        return np.array(rows, np.float64).reshape(-1, len(self.plan.names))
 
     def add(self, points: NDArray[np.float64], origin: str) -> list[str]:
         """Append runs at `points` (run, parameter); what is there already is left out. Returns the names."""
         known = {tuple(p) for p in self.points().tolist()}
         rows = [[float(f"{v:.{_DIGITS}g}") for v in point] for point in np.atleast_2d(points)]
         new = [row for k, row in enumerate(rows) if tuple(row) not in known and row not in rows[:k]]
-        return self.table.add([dict(zip(self.study.names, row, strict=True)) for row in new], origin)
+        return self.table.add([dict(zip(self.plan.names, row, strict=True)) for row in new], origin)
 
     def compute(self, report: Progress | None = None) -> list[Run]:
         """Compute all waiting runs, a limited number at a time, and return the runs that were decided on the way.
@@ -118,7 +118,7 @@ class Campaign:
             while True:
                 running = self._settle()
                 waiting = self.table.runs("waiting")
-                for run in waiting[: max(0, self.study.at_a_time - len(running))]:
+                for run in waiting[: max(0, self.plan.at_a_time - len(running))]:
                     self._start(run)
                 running = self.table.runs("running")
                 decided = [r for r in self.table.runs("done", "failed", "refused") if r.name not in before]
@@ -148,18 +148,18 @@ class Campaign:
     def write_parameters(self) -> Path:
         """Write runs.csv: one row per run that is done, units in the heads."""
         path = self.folder / "runs.csv"
-        study = self.study
+        plan = self.plan
         try:
             with beside(path) as new, new.open("w", newline="", encoding="utf-8") as file:
                 rows = csv.writer(file)
                 rows.writerow(
                     [
                         "run",
-                        *(n if u in ("", "1") else f"{n} ({u})" for n, u in zip(study.names, study.units, strict=True)),
+                        *(n if u in ("", "1") else f"{n} ({u})" for n, u in zip(plan.names, plan.units, strict=True)),
                     ]
                 )
                 for run in self.table.runs("done"):
-                    rows.writerow([run.name, *(repr(run.parameters[n]) for n in study.names)])
+                    rows.writerow([run.name, *(repr(run.parameters[n]) for n in plan.names)])
         except OSError as error:
             raise CampaignError(
                 f"{path}: cannot be written ({error.strerror or error}); free space, then start again"
@@ -178,9 +178,9 @@ class Campaign:
             write_deck(place, self._templates, self._files, run.parameters)
             commands = [
                 [program_of(command, self.home), *arguments(command, values)[1:]]
-                for command in filter(None, (self.study.prepare, self.study.command))
+                for command in filter(None, (self.plan.prepare, self.plan.command))
             ]
-            job.give_order(place, commands, self.study.timeout)
+            job.give_order(place, commands, self.plan.timeout)
             # Noted before it is started: killed in between, the next start finds the job by its lock and does not start another.
             self.table.change(run.name, "running", handle={}, attempts=run.attempts + 1, started=time.time(), reason="")
             handle = self.executor.start(place)
@@ -207,7 +207,7 @@ class Campaign:
                 continue
             ended = ended or job.how_it_ended(self._place(run))  # it may have ended between the two looks
             state, reason, found = self._judged(run, ended)
-            if state == "failed" and run.attempts <= self.study.retries:
+            if state == "failed" and run.attempts <= self.plan.retries:
                 state = "waiting"
             seconds = None if ended is None else ended.seconds
             self.table.change(
@@ -225,7 +225,7 @@ class Campaign:
             return "failed", (ended.reason or f"ended with {ended.code}") + (f": {log}" if log else ""), {}
         verdict = self._quality(run)
         found = verdict.values
-        finished = self.study.finished
+        finished = self.plan.finished
         if finished is not None and not quality.says(place, finished.file, finished.text):
             return (
                 "failed",
@@ -237,10 +237,10 @@ class Campaign:
         if not self._wrote(run):
             return (
                 "failed",
-                f"ended with 0, but wrote no results ({self.study.results or 'any file'}): {job.last_lines(place)}",
+                f"ended with 0, but wrote no results ({self.plan.results or 'any file'}): {job.last_lines(place)}",
                 found,
             )
-        wrong = replace(verdict, ended=None).beyond(self.study.quality.model_dump())
+        wrong = replace(verdict, ended=None).beyond(self.plan.quality.model_dump())
         return ("refused", wrong[0], found) if wrong else ("done", "", found)
 
     def _quality(self, run: Run) -> quality.Quality:
@@ -259,8 +259,8 @@ class Campaign:
     def _wrote(self, run: Run) -> bool:
         """Whether the solver left something that ingest can read."""
         place = self._place(run)
-        if self.study.results:
-            return any(p.exists() and (p.is_dir() or p.stat().st_size) for p in place.glob(self.study.results))
+        if self.plan.results:
+            return any(p.exists() and (p.is_dir() or p.stat().st_size) for p in place.glob(self.plan.results))
         from crashkit.errors import ReadError
         from crashkit.readers import reader_for
 
@@ -272,7 +272,7 @@ class Campaign:
 
     def _result(self, run: Run) -> Path:
         place = self._place(run)
-        found = sorted(place.glob(self.study.results)) if self.study.results else []
+        found = sorted(place.glob(self.plan.results)) if self.plan.results else []
         return found[0] if len(found) == 1 and found[0].is_dir() else place
 
     def _place(self, run: Run) -> Path:
@@ -283,9 +283,9 @@ class Campaign:
 
     def _claim(self) -> None:
         """Note whose folder this is: what decides on a run's result may not change under runs that are there."""
-        study = self.study
+        plan = self.plan
         deciding: dict[str, Any] = {
-            "names": study.names, "units": study.units, "command": study.command, "prepare": study.prepare,
+            "names": plan.names, "units": plan.units, "command": plan.command, "prepare": plan.prepare,
             "template": {p.name: _hash(p) for p in self._templates}, "files": {p.name: _hash(p) for p in self._files},
         }  # fmt: skip
         text = json.dumps(deciding, sort_keys=True)

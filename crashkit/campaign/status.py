@@ -20,13 +20,13 @@ _SIZE, _PAD = 150.0, 8.0
 
 
 def status(campaign: Campaign) -> dict[str, Any]:
-    """Counts of runs by state, the rounds, seconds of solver time, and the newest wish."""
+    """Counts of runs by state, the rounds, seconds of solver time, and the error to reach."""
     runs = campaign.table.runs()
     counts = {state: sum(r.state == state for r in runs) for state in STATES}
     seconds = sum(r.seconds or 0.0 for r in runs)
     return {
         "folder": str(campaign.folder), "runs": len(runs), **counts, "solver_seconds": seconds,
-        "rounds": campaign.table.rounds(), "wish_m": campaign.study.wish(),
+        "rounds": campaign.table.rounds(), "target_m": campaign.plan.target(),
         "trouble": {r.name: f"{r.state}: {r.reason}" for r in runs if r.state in ("failed", "refused")},
     }  # fmt: skip
 
@@ -36,21 +36,21 @@ def write_page(campaign: Campaign) -> Path:
     from jinja2 import Environment, PackageLoader
 
     runs = campaign.table.runs()
-    study = campaign.study
+    plan = campaign.plan
     points = campaign.points()
     pairs = [
         {
-            "x": study.names[a],
-            "y": study.names[b],
-            "dots": _dots(points[:, [a, b]], study.low[[a, b]], study.high[[a, b]], runs),
+            "x": plan.names[a],
+            "y": plan.names[b],
+            "dots": _dots(points[:, [a, b]], plan.low[[a, b]], plan.high[[a, b]], runs),
         }
-        for a, b in combinations(range(len(study.names)), 2)
+        for a, b in combinations(range(len(plan.names)), 2)
     ]
     environment = Environment(loader=PackageLoader("crashkit.campaign", "templates"), autoescape=True)
     found = status(campaign)
     text = environment.get_template("status.html").render(
-        title=campaign.file.stem, status=found, runs=runs, names=study.names, units=study.units, pairs=pairs,
-        colours=COLOURS, curve=_curve(found["rounds"], study.wish()), size=_SIZE,
+        title=campaign.file.stem, status=found, runs=runs, names=plan.names, units=plan.units, pairs=pairs,
+        colours=COLOURS, curve=_curve(found["rounds"], plan.target()), size=_SIZE,
         now=datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M:%S UTC"),
     )  # fmt: skip
     page = campaign.folder / "status.html"
@@ -79,13 +79,13 @@ def _dots(
     ]
 
 
-def _curve(rounds: list[dict[str, Any]], wish: float | None) -> dict[str, Any] | None:
+def _curve(rounds: list[dict[str, Any]], target: float | None) -> dict[str, Any] | None:
     """Error over runs with its interval, as points of a drawing 480 x 220; lengths in mm, logarithmic."""
     known = [r for r in rounds if r.get("error_m")]
     if not known:
         return None
     width, height, left, bottom = 480.0, 220.0, 52.0, 26.0
-    values = [v for r in known for v in (r["low_m"], r["high_m"], r["error_m"])] + ([wish] if wish else [])
+    values = [v for r in known for v in (r["low_m"], r["high_m"], r["error_m"])] + ([target] if target else [])
     first, last = min(values) * 0.9e3, max(values) * 1.1e3
     most = max(r["runs"] for r in known)
 
@@ -103,7 +103,7 @@ def _curve(rounds: list[dict[str, Any]], wish: float | None) -> dict[str, Any] |
              "text": f"{r['runs']} runs: {1e3 * r['error_m']:.3g} mm ({1e3 * r['low_m']:.3g} to {1e3 * r['high_m']:.3g})"}
             for r in known
         ],
-        "wish": None if wish is None else place(0, wish)[1],
+        "target": None if target is None else place(0, target)[1],
         "ticks": [(f"{v:.3g}", place(0, v / 1e3)[1]) for v in np.geomspace(first, last, 4)],
         "last": most,
     }  # fmt: skip

@@ -1,4 +1,4 @@
-"""`crashkit campaign`: from a parameter box and a solver to an error below a wish; `crashkit campaign status`."""
+"""`crashkit campaign`: from a parameter box and a solver to an error that is small enough; `crashkit campaign status`."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ def command(
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="Folder of the campaign.", show_default="beside the file, called as it"),
+        typer.Option("--output", "-o", help="Folder of the campaign.", show_default="beside the file, with its name"),
     ] = None,
     until: Annotated[
         str, typer.Option(help='Error over the box to reach, such as "8 mm".', show_default="what the file says")
     ] = "",
     confidence: Annotated[
-        float | None, typer.Option(help="With which confidence the error must be below.", show_default="0.9")
+        float | None,
+        typer.Option(help="Probability that the error is below --until.", show_default="what the file says, or 0.9"),
     ] = None,
     most_runs: Annotated[
         int | None, typer.Option(help="End at this number of runs.", min=1, show_default=False)
@@ -32,7 +33,7 @@ def command(
     retry: Annotated[bool, typer.Option("--retry", help="Compute failed runs again.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Compute runs with your solver, and go on until the error is below a wish.
+    """Compute runs with your solver, and go on until the error over the box is small enough.
 
     Interrupted or killed, the same command goes on; what was computed is not computed again.
     """

@@ -30,7 +30,8 @@ def command(
     """Propose the next runs: without a dataset they fill the box, with one they lower its error most."""
     from typing import get_args
 
-    from crashkit.api.propose import Method, propose
+    from crashkit.api.propose import propose
+    from crashkit.campaign.plan import Method
     from crashkit.errors import OutputError
 
     if method not in get_args(Method):

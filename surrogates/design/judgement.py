@@ -38,9 +38,9 @@ class Judgement:
     runs: int
     means: NDArray[np.float64]
 
-    def below(self, wish: float) -> bool:
-        """Whether the error is below `wish`, m, with the asked confidence."""
-        return bool(np.quantile(self.means, self.confidence) < wish)
+    def below(self, target: float) -> bool:
+        """Whether the error is below `target`, m, with the asked confidence."""
+        return bool(np.quantile(self.means, self.confidence) < target)
 
 
 def judge(

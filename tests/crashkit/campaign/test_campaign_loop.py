@@ -32,7 +32,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def finished(study: Path) -> Path:
-    """A campaign whose wish is out of reach, ended by its limit of 12 runs."""
+    """A campaign whose target is out of reach, ended by its limit of 12 runs."""
     said: list[str] = []
     summary = run_campaign(study, until="0.001 mm", most_runs=12, say=said.append)
     assert "12 runs are computed, the most that were allowed" in summary.why
@@ -62,7 +62,7 @@ def test_the_status_is_told_in_the_terminal_and_on_a_page(finished: Path) -> Non
     assert "Error over the box" in page
 
 
-def test_a_wish_that_is_met_ends_the_campaign_without_another_run(study: Path, finished: Path) -> None:
+def test_a_target_that_is_met_ends_the_campaign_without_another_run(study: Path, finished: Path) -> None:
     result = CliRunner().invoke(app, ["campaign", str(study), "--until", "1 m"])
     assert result.exit_code == 0, result.output
     assert "the error is below 1000 mm with a confidence of 90 %" in result.stderr
@@ -94,3 +94,9 @@ def test_a_box_of_other_parameters_is_refused(finished: Path, tmp_path: Path) ->
     box.write_text("parameters: {velocity: {low: 1, high: 2, unit: m/s}}\n")
     with pytest.raises(CampaignError, match="differ in"):
         propose(finished / "crash.zarr", 2, box=box)
+
+
+def test_a_confidence_that_is_none_is_refused_before_a_run_is_computed(study: Path, tmp_path: Path) -> None:
+    with pytest.raises(CampaignError, match=r"confidence of 90 .* between 0\.5 and 1"):
+        run_campaign(study, tmp_path / "new", until="1 mm", confidence=90)
+    assert not (tmp_path / "new").exists()

@@ -18,8 +18,9 @@ from crashkit.campaign import job
 from crashkit.campaign.box import CampaignError
 from crashkit.campaign.campaign import Campaign
 from crashkit.campaign.deck import arguments
-from crashkit.campaign.study import length_of
+from crashkit.campaign.plan import length_of
 from crashkit.campaign.table import Table
+from crashkit.errors import CrashkitError
 
 EXAMPLES = Path(__file__).parents[3] / "examples" / "campaign"
 POINTS = np.array([[8.0, 40.0, 50.0], [6.0, 30.0, -100.0]])
@@ -237,7 +238,9 @@ def test_a_template_that_cannot_be_filled_is_refused_before_anything_runs(
     [
         ("high: 12", "high: 4", "parameters.speed: low 4 and high 4 make no range"),
         ("high: 12", "hihg: 12", "parameters.speed"),
-        ("at_a_time: 2", "at_once: 2", "at_once: is not known"),
+        ("at_a_time: 2", "at_once: 2", "at_once is not known"),
+        ("at_a_time: 2", "at_a_tim: 2", "did you mean at_a_time"),
+        ("at_a_time: 2", "timeout: 10 minutes", "timeout: expected a duration such as 90 s.*found '10 minutes'"),
         ("command: ", "command: no_such_solver_", "not on the PATH|no such program"),
         ("at_a_time: 2", "constraints: ['speed < velocity']", "names 'velocity'"),
         ("template: [frame.deck]", "template: [nothing.deck]", "no such file"),
@@ -251,7 +254,7 @@ def test_a_campaign_file_that_does_not_fit_is_refused_in_one_line(
     text = file.read_text()
     assert old in text
     file.write_text(text.replace(old, new).replace(sys.executable, sys.executable if "no_such" not in new else "x"))
-    with pytest.raises(CampaignError, match=words) as caught:
+    with pytest.raises(CrashkitError, match=words) as caught:
         Campaign(file, tmp_path / "out")
     assert "\n" not in str(caught.value)
 
@@ -294,7 +297,7 @@ def test_braces_in_commands_are_values_and_nothing_else() -> None:
 
 
 @pytest.mark.parametrize(("text", "metres"), [("8 mm", 0.008), ("0.5cm", 0.005), ("1 m", 1.0)])
-def test_a_wish_is_a_length(text: str, metres: float) -> None:
+def test_a_target_is_a_length(text: str, metres: float) -> None:
     assert length_of(text) == pytest.approx(metres)
 
 

@@ -56,7 +56,7 @@ def test_a_study_becomes_the_commands_one_would_type(tmp_path: Path) -> None:
             "train.models.mh.epoch is not known; did you mean epochs?",
         ),
         ("a: [", "cannot be read as YAML"),
-        ("- a", "holds no keys"),
+        ("- a", "holds no names with values"),
         ("!!python/object/apply:os.abort []", "cannot be read as YAML"),
     ],
 )

@@ -1,4 +1,4 @@
-"""The campaign file: one YAML that says what varies, how one run is computed, and what is wished for."""
+"""The campaign file: one YAML that says what varies, how one run is computed, and which error to reach."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from crashkit.campaign.box import Box, CampaignError, checked, read_yaml
+from crashkit.campaign.box import Box, CampaignError
 from crashkit.quality import LIMITS
+from crashkit.yaml_file import checked, read_yaml
 
 
 def _split(value: Any) -> Any:
@@ -24,15 +25,23 @@ def _seconds(value: Any) -> Any:
     if not isinstance(value, str):
         return value
     number, _, unit = value.strip().partition(" ")
-    factor = {"": 1, "s": 1, "min": 60, "h": 3600, "d": 86400}.get(unit.strip())
+    factors = {"": 1, "s": 1, "min": 60, "h": 3600, "d": 86400}
     try:
-        return float(number) * (factor or float("nan"))
-    except ValueError:
-        return value
+        return float(number) * factors[unit.strip()]
+    except (ValueError, KeyError):
+        raise ValueError("expected a duration such as 90 s, 10 min, 2 h or 1 d") from None
 
 
 Command = Annotated[list[str], BeforeValidator(_split), Field(min_length=1)]
 Duration = Annotated[float, BeforeValidator(_seconds), Field(gt=0)]
+
+
+Method = Literal["expected-reduction", "halton", "sobol", "random"]
+
+
+def sequence(method: Method) -> Literal["halton", "sobol", "random"]:
+    """The sequence that fills the box where no model is asked."""
+    return "halton" if method == "expected-reduction" else method
 
 
 class _Strict(BaseModel):
@@ -60,7 +69,7 @@ class Design(_Strict):
     start: int = Field(16, ge=2)
     batch: int = Field(8, ge=1)
     seed: int = Field(0, ge=0)
-    method: Literal["expected-reduction", "halton", "sobol", "random"] = "expected-reduction"
+    method: Method = "expected-reduction"
 
 
 class Ingest(_Strict):
@@ -74,7 +83,7 @@ class Ingest(_Strict):
     time: tuple[float, ...] | None = None
 
 
-class Study(Box):
+class Plan(Box):
     """A campaign.
 
     parameters, constraints  the box
@@ -130,7 +139,7 @@ class Study(Box):
     slurm: dict[str, Any] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _whole(self) -> Study:
+    def _whole(self) -> Plan:
         if not self.template and self.prepare is None:
             raise ValueError("neither template nor prepare is given; one of them must write the deck of a run")
         reserved = {"study", "run", "name"} & set(self.parameters)
@@ -138,8 +147,8 @@ class Study(Box):
             raise ValueError(f"a parameter cannot be called {reserved.pop()!r}; that name means a folder in commands")
         return self
 
-    def wish(self) -> float | None:
-        """The error that is wished for, m; None where the campaign has none."""
+    def target(self) -> float | None:
+        """The error to reach, m; None where the campaign has none."""
         return None if self.until is None else length_of(self.until)
 
 
@@ -161,14 +170,14 @@ def length_of(text: str) -> float:
     return value
 
 
-def read_study(path: str | Path) -> Study:
+def read_plan(path: str | Path) -> Plan:
     """The campaign file at `path`.
 
     Raises
     ------
-    CampaignError
-        That names the place.
+    CrashkitError
+        Where the file cannot be read or something in it does not fit, naming the place.
     """
-    study: Study = checked(Study, read_yaml(path), path)
-    study.wish()
-    return study
+    plan = checked(Plan, read_yaml(path, "a campaign, such as examples/campaign/frame.yaml"), path)
+    plan.target()
+    return plan
