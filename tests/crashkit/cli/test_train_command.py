@@ -135,6 +135,15 @@ def test_what_is_trained_from_disk_is_what_is_trained_from_arrays(crash: Path, m
     np.testing.assert_array_equal(stored.predict(mu), expected.predict(mu))
 
 
+def test_mirror_planes_are_looked_for_where_a_parameter_may_say_the_side() -> None:
+    both = dataset(4)
+    assert open_campaign(source_of(both), symmetry=True).mirrors
+    assert not open_campaign(source_of(both)).mirrors
+    one = both.assign(impact_angle=abs(both["impact_angle"]))
+    assert not open_campaign(source_of(one), symmetry=True).mirrors
+    assert open_campaign(source_of(one), symmetry=True, odd=("impact_angle",)).mirrors
+
+
 def of_level(u: np.ndarray):  # type: ignore[no-untyped-def]
     return lambda level: u if level == 0 else u[:, :, plate.levels()[level - 1].kept]
 
