@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from crashkit.mesh.levels import Hierarchy
+    from crashkit.selection import WhichRuns
 
 
 def coarsen(
@@ -23,6 +24,7 @@ def coarsen(
     *,
     selection: Literal["quadric", "vtk"] = "quadric",
     pair_distance: float | None = None,
+    test: WhichRuns | None = None,
     report: Progress | None = None,
     progress: bool | Literal["auto"] = "auto",
 ) -> Hierarchy:
@@ -45,6 +47,8 @@ def coarsen(
         How nodes are selected: quadric (half-edge contraction) or vtk (vtkQuadricDecimation).
     pair_distance
         m; see `crashkit.mesh.build_hierarchy`.
+    test
+        Runs held out for testing, as in `crashkit.train`: the interpolation errors that are stored do not see them.
     report
         Called with (what, runs done, runs, note) in the pass over the runs.
     progress
@@ -55,17 +59,23 @@ def coarsen(
     MeshError
         For numbers of nodes that cannot be had.
     DataError, ReadError, OutputError
-        For the files.
+        For the files, and for `test` runs that are not there.
     """
     import xarray as xr
 
+    from crashkit.dataset import open_dataset
     from crashkit.errors import MeshError
     from crashkit.mesh.hierarchy import build_hierarchy, ratios_to_counts
     from crashkit.mesh.store import mesh_of, open_mesh, parts_without_faces, write_hierarchy
+    from crashkit.selection import runs_of
 
     if nodes is not None and ratios is not None:
         raise MeshError("both node counts and ratios were given; give one of them")
     in_hand = isinstance(dataset, xr.Dataset)
+    held: list[int] = []
+    if test is not None and not isinstance(dataset, xr.Dataset):
+        with open_dataset(dataset, chunks=None) as opened:
+            held = runs_of([str(name) for name in opened["sim"].values], test)
     mesh = mesh_of(dataset) if isinstance(dataset, xr.Dataset) else open_mesh(Path(dataset))
     try:
         hierarchy = build_hierarchy(
@@ -81,5 +91,5 @@ def coarsen(
     if not isinstance(dataset, xr.Dataset):
         for text in parts_without_faces(Path(dataset)):
             warnings.warn(text, stacklevel=2)
-        write_hierarchy(dataset, hierarchy, report=watched(report, progress))
+        write_hierarchy(dataset, hierarchy, test=held, report=watched(report, progress))
     return hierarchy

@@ -69,7 +69,7 @@ def describe_dataset(dataset: xr.Dataset, path: Path) -> dict[str, Any]:
         "erodes": "alive" in dataset or "cell_alive" in dataset,
         "largest_displacement": _largest(dataset),
         "checksum": known.get("checksum"),
-        "levels": _levels(path),
+        **_levels(path),
     }  # fmt: skip
 
 
@@ -107,10 +107,12 @@ def _bytes(path: Path) -> int:
     return sum(f.stat().st_size for f in path.rglob("*") if f.is_file()) if path.is_dir() else path.stat().st_size
 
 
-def _levels(path: Path) -> list[dict[str, Any]]:
-    from crashkit.mesh.store import has_hierarchy, summarize_hierarchy
+def _levels(path: Path) -> dict[str, Any]:
+    from crashkit.mesh.store import has_hierarchy, lifting_errors_over, summarize_hierarchy
 
-    return list(summarize_hierarchy(path)) if has_hierarchy(path) else []
+    if not has_hierarchy(path):
+        return {"levels": []}
+    return {"levels": list(summarize_hierarchy(path)), "interpolation_errors_over": lifting_errors_over(path)}
 
 
 def describe_model(surrogate: Surrogate, path: Path) -> dict[str, Any]:

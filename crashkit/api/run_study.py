@@ -98,7 +98,7 @@ def steps(study: Study, home: Path) -> list[Step]:
     out.append(
         Step(
             "Coarser meshes, each a subset of the nodes",
-            ("coarsen", str(data), *coarsen, "--picture", str(picture)),
+            ("coarsen", str(data), *coarsen, "--test", str(study.train.test), "--picture", str(picture)),
             picture,
             depends=lambda: f"{_checksum(data)} {_has_hierarchy(data)}",
         )

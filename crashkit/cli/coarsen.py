@@ -38,6 +38,13 @@ def command(
             help="Merge nodes closer than this (m) even if no edge connects them.", show_default="1 % of the size"
         ),
     ] = None,
+    test: Annotated[
+        str,
+        typer.Option(
+            help="Runs held out for testing, as for crashkit train: interpolation errors are measured without them.",
+            show_default="none",
+        ),
+    ] = "",
     picture: Annotated[
         Path | None, typer.Option(help="Also draw all levels side by side: levels.png.", show_default="none")
     ] = None,
@@ -51,7 +58,7 @@ def command(
     import warnings
 
     from crashkit.extras import need
-    from crashkit.mesh.store import open_mesh, summarize_hierarchy
+    from crashkit.mesh.store import lifting_errors_over, open_mesh, summarize_hierarchy
 
     if picture is not None:
         need("--picture", "report")
@@ -69,10 +76,11 @@ def command(
             factors or None,
             selection="vtk" if selection == "vtk" else "quadric",
             pair_distance=pair_distance,
+            test=test or None,
             report=shown.step,
         )
     without = [str(w.message) for w in told if w.category is UserWarning]
-    levels = summarize_hierarchy(path)
+    levels, over = summarize_hierarchy(path), lifting_errors_over(path)
     mesh = open_mesh(path)
     files = [] if vtp is None else _write_levels(vtp, hierarchy, mesh)
     drawn = picture is not None and _draw(picture, hierarchy, mesh, levels)
@@ -82,24 +90,25 @@ def command(
                 "path": path,
                 "settings": hierarchy.settings,
                 "levels": levels,
+                "interpolation_errors_over": over,
                 "vtp": files,
                 "picture": picture if drawn else None,
                 "parts_without_faces": without,
             }
         )
         return
-    show(path, levels)
+    show(path, levels, over)
     for text in without:
         say(f"  {text}")
     if files:
         say(f"levels as VTP: {vtp}")
-    what_next(picture if drawn else path, ("train", path, "-o", "model", "--test", "0.25"))
+    what_next(picture if drawn else path, ("train", path, "-o", "model", "--test", test or "0.25"))
 
 
-def show(path: Path, levels: list[dict[str, Any]]) -> None:
-    """What each level is, and what it costs."""
+def show(path: Path, levels: list[dict[str, Any]], over: str) -> None:
+    """What each level is, and what it costs; `over` says on which runs."""
     table(
-        f"Mesh hierarchy of {path}",
+        f"Mesh hierarchy of {path}, interpolation errors over {over}",
         ("level", "nodes", "faces", "edges", "distance mean / max (cm)", "interpolation error mean / max (cm)"),
         (
             (

@@ -41,6 +41,7 @@ def show(result: DemoResult) -> None:
             for r in result.performance
         ),
     )
+    say(result.regressions)
     say("Open next:")
     for path, what in result.files.items():
         say(f"  {path}  {what}")

@@ -111,7 +111,7 @@ def _print_dataset(found: dict[str, Any]) -> None:
         line("hierarchy", f"none yet; make one with crashkit coarsen {found['path']}")
         return
     table(
-        "mesh hierarchy",
+        f"mesh hierarchy, interpolation errors over {found['interpolation_errors_over']}",
         ("level", "nodes", "faces", "distance mean / max (mm)", "interpolation error mean / max (cm)"),
         [
             (

@@ -12,7 +12,7 @@ import hashlib
 import json
 import shutil
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,11 +40,13 @@ if TYPE_CHECKING:
 _BUDGET = 512 << 20
 
 
-def write_hierarchy(path: str | Path, hierarchy: Hierarchy, *, report: Progress | None = None) -> list[LiftingError]:
-    """Write `hierarchy` into the dataset at `path` and return the lifting error of each level over all runs.
+def write_hierarchy(
+    path: str | Path, hierarchy: Hierarchy, *, test: Collection[int] = (), report: Progress | None = None
+) -> list[LiftingError]:
+    """Write `hierarchy` into the dataset at `path` and return the lifting error of each level.
 
-    The displacements are read once, a block of states at a time; `report` hears of each
-    run. An older hierarchy is replaced when the new one is complete.
+    The displacements are read once, a block of states at a time; `report` hears of each run. The runs at the places
+    `test` do not count in the lifting errors. An older hierarchy is replaced when the new one is complete.
 
     Raises
     ------
@@ -65,12 +67,13 @@ def write_hierarchy(path: str | Path, hierarchy: Hierarchy, *, report: Progress 
             "mesh_checksum": mesh_checksum(dataset),
             "dataset_checksum": str(dataset.attrs.get("checksum", "")),
             "runs": json.dumps([str(s) for s in dataset["sim"].values]),
+            "lifting_error_without": json.dumps([str(dataset["sim"].values[k]) for k in sorted(test)]),
             "levels": len(hierarchy.levels),
         }
         try:
             with _target(path) as target:
                 target.group("hierarchy", about)
-                errors = _stream(path, dataset, hierarchy, target, report)
+                errors = _stream(path, dataset, hierarchy, target, test, report)
                 for level, error in zip(hierarchy.levels, errors, strict=True):
                     _write_level(target, level, error)
         except OSError as error:
@@ -150,6 +153,14 @@ def level_displacement(path: str | Path, level: int, runs: Sequence[int] | None 
             block = stored.isel(sim=int(run)).values
             out[k] = block if chosen is None else block[:, chosen]
     return out
+
+
+def lifting_errors_over(path: str | Path) -> str:
+    """Over which runs lifting errors were measured: "all 36 runs" or "27 training runs"."""
+    about = _about(Path(path))
+    runs, without = (len(json.loads(about.get(name) or "[]")) for name in ("runs", "lifting_error_without"))
+    count = runs - without
+    return f"{count} training run{'s' if count > 1 else ''}" if without else f"all {runs} runs"
 
 
 def part_nodes(dataset: xr.Dataset) -> list[NDArray[np.int64]]:
@@ -317,6 +328,7 @@ def _stream(
     dataset: xr.Dataset,
     hierarchy: Hierarchy,
     target: _Target,
+    test: Collection[int],
     report: Progress | None,
 ) -> list[LiftingError]:
     """One pass over the fine field: the displacements of level 1 go out, lifting errors add up."""
@@ -331,7 +343,8 @@ def _stream(
         for begin, end in split_states(states, hierarchy.n_nodes, _BUDGET):
             with reading_dataset(path):
                 block = dataset["displacement"].isel(sim=run, time=slice(begin, end)).values
-            meter.add(block)
+            if run not in test:
+                meter.add(block)
             write(run, begin, end, block[:, first.kept].astype(np.float32))
         if report:
             report("interpolation errors", run + 1, runs, "")

@@ -32,7 +32,7 @@ def test_a_study_becomes_the_commands_one_would_type(tmp_path: Path) -> None:
     told = [line.replace(f"{tmp_path}/", "") for line in result.stdout.splitlines()]
     assert told == [
         "crashkit ingest runs -o results/crash.zarr --params table.csv --units mm-ms-kg --parts floor,7 --allow-incomplete",
-        "crashkit coarsen results/crash.zarr --nodes 60,16 --picture results/levels.png",
+        "crashkit coarsen results/crash.zarr --nodes 60,16 --test 5:8 --picture results/levels.png",
         "crashkit train results/crash.zarr -o results/mh --model mh --test 5:8 --epochs 2 --set 'level.channels=[3, 6]'",
         "crashkit train results/crash.zarr -o results/small --model podnn --test 5:8 --preset paper",
         "crashkit evaluate results/crash.zarr results/mh results/small -o results/report --write-vtu --probes 12,340",

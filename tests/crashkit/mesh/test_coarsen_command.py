@@ -32,7 +32,22 @@ def test_levels_are_stored_and_told_with_their_lifting_errors(path: Path) -> Non
     code, out, _ = run(path, "--nodes", "120,30")
     assert code == 0
     assert [level.n_nodes for level in open_hierarchy(path).levels] == [120, 30]
-    assert "interpolation" in out.replace("\n", " ")
+    assert f"interpolation errors over all {campaign().sizes['sim']} runs" in out.replace("\n", " ")
+
+
+def test_interpolation_errors_leave_test_runs_out(path: Path) -> None:
+    runs = campaign().sizes["sim"]
+    errors = {}
+    for test in ("", "0:1", f"1:{runs}"):
+        code, out, _ = run(path, "--nodes", "120", *(("--test", test) if test else ()), "--json")
+        assert code == 0
+        told = json.loads(out)
+        errors[test] = told["levels"][0]["lifting_error_mean"]
+    assert told["interpolation_errors_over"] == "1 training run"
+    assert errors[""] == pytest.approx(((runs - 1) * errors["0:1"] + errors[f"1:{runs}"]) / runs, rel=1e-5)
+    code, _, err = run(path, "--nodes", "120", "--test", "nobody")
+    assert code == 1
+    assert "nobody" in err
 
 
 def test_the_default_keeps_an_eighth_a_quarter_and_a_quarter(path: Path) -> None:
