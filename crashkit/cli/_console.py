@@ -6,7 +6,9 @@ import contextlib
 import json
 import math
 import shlex
+import shutil
 import sys
+import textwrap
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -30,18 +32,33 @@ def fail(message: str, code: int = 1) -> NoReturn:
     raise typer.Exit(code)
 
 
-def say(message: str) -> None:
-    """A line for people, on stderr; what its encoding lacks is written as `\\xe9` instead of ending in an error."""
+def say(message: str, *, wrap: bool = True) -> None:
+    """A line for people, on stderr; what its encoding lacks is written as `\\xe9` instead of ending in an error.
+
+    On a terminal that is narrower, it is broken between words; in a file or a pipe it stays one line.
+    """
     encoding = getattr(sys.stderr, "encoding", None) or "utf-8"
+    if wrap and sys.stderr.isatty():
+        message = wrapped(message, shutil.get_terminal_size().columns)
     typer.echo(message.encode(encoding, "backslashreplace").decode(encoding), err=True)
+
+
+def wrapped(text: str, width: int) -> str:
+    """`text` broken between words, further lines set in; paths and names are never broken."""
+    indent = text[: len(text) - len(text.lstrip())]
+    lines = textwrap.wrap(
+        text, width, subsequent_indent=f"{indent}  ", break_long_words=False, break_on_hyphens=False,
+        replace_whitespace=False, drop_whitespace=True,
+    )  # fmt: skip
+    return "\n".join(lines)
 
 
 def what_next(look: Path | str | None, *commands: Iterable[object]) -> None:
     """The last lines of a command: the path to look at, and the next command, ready to be pasted."""
     if look is not None:
-        say(f"look at  {look}")
+        say(f"look at  {look}", wrap=False)
     for command in commands:
-        say("next     crashkit " + shlex.join(map(str, command)))
+        say("next     crashkit " + shlex.join(map(str, command)), wrap=False)
 
 
 @contextlib.contextmanager

@@ -165,7 +165,10 @@ def show(surrogate: Surrogate, output: Path) -> None:
         say(line)
     if record.choice:
         by = "on validation runs" if record.validation_runs and not record.physics else "by cross-validation"
-        say(f"chosen {by}: " + ", ".join(f"{k} {v}" for k, v in record.choice.items()))
+        pieces = [f"{k} {v}" for k, v in record.choice.items()]
+        several = any("(" in piece for piece in pieces)  # one line for each level
+        for line in pieces if several else [", ".join(pieces)]:
+            say(f"chosen {by}: {line}")
 
 
 def _physics(physics: Mapping[str, Any]) -> list[str]:

@@ -112,8 +112,13 @@ def test_a_model_without_a_best_linear_compression_is_shown_all_the_same(
     (tmp_path / "report").mkdir()
     rows = [{"model": "POD-GPR", "error_cm": 1.649, "worst_run_cm": 8.113, "pod_floor_cm": None}]
     (tmp_path / "report" / "report.json").write_text(json.dumps({"performance": rows}))
+    (tmp_path / "mh").mkdir()
+    choice = {"MH3": "75 % process (network 1.89 cm, process 1.67 cm); reduction as computed", "MH1": "network (..)"}
+    (tmp_path / "mh" / "model.json").write_text(json.dumps({"record": {"choice": choice}}))
     show(demo_result(tmp_path))
-    (row,) = [line for line in capsys.readouterr().out.splitlines() if "POD-GPR" in line]
+    printed = capsys.readouterr()
+    assert "From parameters to latent numbers: MH3 75 % process, MH1 network, as chosen" in printed.err
+    (row,) = [line for line in printed.out.splitlines() if "POD-GPR" in line]
     assert row.replace("│", " ").replace("|", " ").split()[1:] == ["1.65", "8.11", "-"]
 
 

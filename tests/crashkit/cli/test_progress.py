@@ -8,7 +8,7 @@ import time
 import pytest
 
 from crashkit.cli import _progress
-from crashkit.cli._console import print_json, say
+from crashkit.cli._console import print_json, say, wrapped
 from crashkit.cli._progress import Progress, line
 
 
@@ -84,3 +84,11 @@ def test_names_that_the_terminal_cannot_show_do_not_end_a_command(monkeypatch) -
     say("run Längsträger")
     stream.flush()
     assert stream.buffer.getvalue() == b"run L\\xe4ngstr\\xe4ger\n"
+
+
+def test_long_lines_are_broken_between_words_and_paths_never() -> None:
+    path = "/a" * 50
+    lines = wrapped(f"  {'word ' * 20}{path} and more", 40).split("\n")
+    assert all(len(line) <= 40 or line.strip() == path for line in lines)
+    assert [line[: len(line) - len(line.lstrip())] for line in lines] == ["  ", *["    "] * (len(lines) - 1)]
+    assert " ".join(" ".join(lines).split()) == f"{'word ' * 20}{path} and more"
