@@ -13,6 +13,9 @@ from crashkit.campaign.box import Box, CampaignError
 if TYPE_CHECKING:
     from surrogates.design.criteria import Posterior
     from surrogates.design.judgement import Judgement
+    from surrogates.models.pod_regression import PodRegression
+    from surrogates.physics.registration import Registration
+    from surrogates.regression.gaussian import Gaussian
     from surrogates.surrogate import Surrogate
 
 # Points that stand for the box, and candidates for the next runs.
@@ -83,7 +86,7 @@ class Known:
 
     def deviation(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """(point,): what the process believes its error to be at points of the box, up to a factor."""
-        core, registration = _process(self.surrogate)
+        core, _, registration = _process(self.surrogate)
         parameters = self.parameters(points)
         return np.asarray(core.deviation(registration.read(parameters)) * self.size(parameters))
 
@@ -94,7 +97,7 @@ class Known:
         the course, where runs are further apart: size of the run times the mean spread of the training runs over the
         part of the course that it goes through.
         """
-        core, registration = _process(self.surrogate)
+        core, _, registration = _process(self.surrogate)
         courses = core.data.values.astype(np.float64)
         spread = np.sqrt(((courses - courses.mean(axis=0)) ** 2).sum(axis=2).mean(axis=0))
         out = registration.clock.size(parameters)
@@ -109,9 +112,9 @@ class Known:
         The ratios of error to deviation of left-out runs, averaged with the process's own correlation as weight: where
         the process is wrong rather than far from runs, as at a fold, it is above its mean of about 1.
         """
-        core, registration = _process(self.surrogate)
+        core, machine, registration = _process(self.surrogate)
         ratios, runs = self._ratios()
-        kernel = core.machine.kernel
+        kernel = machine.kernel
         corners = np.stack([core.low, core.high])
         from surrogates.data.inputs import over_range
 
@@ -136,8 +139,8 @@ class Known:
         from surrogates.data.inputs import over_range
         from surrogates.design.criteria import Posterior
 
-        core, registration = _process(self.surrogate)
-        kernel = core.machine.kernel
+        core, machine, registration = _process(self.surrogate)
+        kernel = machine.kernel
         corners = np.stack([core.low, core.high])
 
         def inputs(parameters: NDArray[np.float64]) -> list[NDArray[np.float64]]:
@@ -174,11 +177,12 @@ class Known:
         return float(after / before)
 
 
-def _process(surrogate: Surrogate):  # type: ignore[no-untyped-def]
+def _process(surrogate: Surrogate) -> tuple[PodRegression, Gaussian, Registration]:
+    """The POD model in `surrogate`, its process over whole runs, and their registration. Raises CampaignError."""
     from surrogates.models.pod_regression import PodRegression
     from surrogates.regression.gaussian import Gaussian
 
     core = surrogate.core
     if not isinstance(core, PodRegression) or not isinstance(core.machine, Gaussian) or core.inputs != "trajectory":
         raise CampaignError("proposals ask a process over whole runs; train pod-gpr on these runs")
-    return core, surrogate.registration
+    return core, core.machine, surrogate.registration

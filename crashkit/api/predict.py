@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from crashkit.writers import paraview
+
 if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import ArrayLike
@@ -14,7 +16,7 @@ if TYPE_CHECKING:
     from surrogates.surrogate import Surrogate
 
 
-SUFFIXES = (".pvd", ".vtkhdf", ".vtu", ".vtp", ".npz")
+SUFFIXES = (*paraview.SUFFIXES, ".npz")
 
 
 def load_model(folder: str | Path) -> Model:

@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from crashkit.yaml_file import checked, read_yaml
+from surrogates.settings import MODELS, ModelName
 
-KINDS = ("mh", "podnn", "aenn", "gaenn", "pod-gpr", "pod-rbf")
 Positive = Annotated[int, Field(ge=1)]
 
 
@@ -49,7 +49,7 @@ class CoarsenStep(_Strict):
 class ModelStep(_Strict):
     """Options of `crashkit train` for one model; `model` is by default what the model is called."""
 
-    model: Literal["mh", "podnn", "aenn", "gaenn", "pod-gpr", "pod-rbf"] | None = None
+    model: ModelName | None = None
     preset: Literal["fast", "paper"] | None = None
     config: Path | None = None
     set: dict[str, Any] = {}
@@ -69,8 +69,8 @@ class TrainStep(_Strict):
         for name, options in self.models.items():
             if Path(name).name != name or name.startswith("."):
                 raise ValueError(f"{name!r} cannot be the name of a model folder")
-            if (options is None or options.model is None) and name not in KINDS:
-                raise ValueError(f"model {name!r} needs a kind, such as model: mh; known are {', '.join(KINDS)}")
+            if (options is None or options.model is None) and name not in MODELS:
+                raise ValueError(f"model {name!r} needs a kind, such as model: mh; known are {', '.join(MODELS)}")
         return self
 
 

@@ -44,8 +44,9 @@ def command(
 def _run(source: Path, run: str, output: Path, as_json: bool) -> None:
     from crashkit.api.export import export_run
     from crashkit.errors import OutputError
+    from crashkit.writers.paraview import SUFFIXES
 
-    if output.suffix not in (".pvd", ".vtkhdf", ".vtu", ".vtp"):
+    if output.suffix not in SUFFIXES:
         raise OutputError(f"{output}: a run is written as .pvd or .vtkhdf (.vtu or .vtp for a single state)")
     with Progress(f"reading run {run} of {source}", quiet=as_json):
         files = export_run(source, run, output)

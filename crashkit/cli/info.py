@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,6 +9,7 @@ import typer
 
 from crashkit.cli._console import console, print_json, table, what_next
 from crashkit.cli._progress import Progress
+from crashkit.display import listed
 
 # How values of these units are shown to people: factor and unit. JSON keeps SI.
 _SHOWN = {"Pa": (1e-6, "MPa"), "s": (1e3, "ms"), "m": (1e3, "mm")}
@@ -85,9 +85,9 @@ def _print_dataset(found: dict[str, Any]) -> None:
     out.print(f"{found['path']}: {found['bytes_on_disk'] / 1e6:.1f} MB on disk", markup=False)
     line("solver", f"{found['solver']}; read in {found['units_read']}, kept in SI")
     incomplete = found["incomplete_runs"]
-    line("runs", f"{found['runs']}" + (f", incomplete: {_listed(incomplete)}" if incomplete else ""))
+    line("runs", f"{found['runs']}" + (f", incomplete: {listed(incomplete, most=8)}" if incomplete else ""))
     if found["marked_runs"]:
-        line("marked", _listed([f"{run} ({why})" for run, why in found["marked_runs"].items()], most=3))
+        line("marked", listed([f"{run} ({why})" for run, why in found["marked_runs"].items()], most=3))
     moved = found["alignment_error"]
     line(
         "states",
@@ -96,7 +96,7 @@ def _print_dataset(found: dict[str, Any]) -> None:
     )
     shapes = "" if found["one_shape"] else "; every run has its own shape"
     line("mesh", f"{found['nodes']} nodes, {found['faces']} faces, {found['cells']} solids and beams{shapes}")
-    line("parts", _listed([f"{p['id']} {p['name']} ({_elements(p)})" for p in found["parts"]]))
+    line("parts", listed([f"{p['id']} {p['name']} ({_elements(p)})" for p in found["parts"]], most=8))
     fields = [f"{f['name']} ({f['units']}, on {f['on']}s)" for f in found["fields"]]
     line("fields", ", ".join(["displacement (m, on nodes)", *fields]) + ("; elements erode" if found["erodes"] else ""))
     most = found["largest_displacement"]
@@ -182,9 +182,8 @@ def _number(value: object, factor: float) -> str:
     return f"{factor * value:.4g}" if isinstance(value, (int, float)) else "-"
 
 
-def _shown(value: float, unit: str, *, with_unit: bool = True) -> str:
-    factor = _SHOWN.get(unit, (1.0, unit))[0]
-    return f"{factor * value:.4g}" + (f" {_unit(unit)}" if with_unit else "")
+def _shown(value: float, unit: str) -> str:
+    return f"{_SHOWN.get(unit, (1.0, unit))[0] * value:.4g} {_unit(unit)}"
 
 
 def _unit(unit: str) -> str:
@@ -194,8 +193,3 @@ def _unit(unit: str) -> str:
 def _elements(part: dict[str, Any]) -> str:
     counts = [f"{part[kind]} {kind}" for kind in ("faces", "cells") if part[kind]]
     return ", ".join(counts) or "empty"
-
-
-def _listed(texts: Iterable[str], most: int = 8) -> str:
-    known = list(texts)
-    return ", ".join(known[:most]) + (f" and {len(known) - most} more" if len(known) > most else "")

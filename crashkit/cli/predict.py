@@ -116,11 +116,12 @@ def _wanted(
     """Name, parameters, file and truth of every run that was asked for."""
     names = surrogate.record.ranges.names
     if params is not None:
+        from crashkit.api.predict import SUFFIXES
         from crashkit.errors import OutputError
         from crashkit.ingestion.parameter_table import read_parameter_table
         from crashkit.output import file_name
 
-        if output.suffix in (".vtu", ".vtp", ".npz", ".pvd", ".vtkhdf"):
+        if output.suffix in SUFFIXES:
             targets = {r: output.with_name(f"{output.stem}_{file_name(r)}{output.suffix}") for r in _rows(params)}
         elif output.suffix:
             raise OutputError(f"{output}: of a table, expected a folder, or NAME.pvd, NAME.vtkhdf or NAME.npz")

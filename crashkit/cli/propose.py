@@ -33,6 +33,7 @@ def command(
     from crashkit.api.propose import propose
     from crashkit.campaign.plan import Method
     from crashkit.errors import OutputError
+    from data_schema.replace import beside
 
     if method not in get_args(Method):
         raise typer.BadParameter(f"{method!r}; expected one of {', '.join(get_args(Method))}", param_hint="--method")
@@ -45,7 +46,8 @@ def command(
     heads = [n if u in ("", "1") else f"{n} ({u})" for n, u in table.attrs["units"].items()]
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
-        table.to_csv(output, index=False, header=heads)
+        with beside(output) as new:
+            table.to_csv(new, index=False, header=heads)
     except OSError as error:
         raise OutputError(f"{output}: cannot be written ({error.strerror or error}); choose another with -o") from error
     now, after = table.attrs.get("expected_error_m"), table.attrs.get("expected_error_after_m")

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from crashkit.display import listed
 from crashkit.errors import CrashkitError, DataError, ReadError
 from crashkit.ingestion.life import Dead, lives_at_start, never_alive
 from crashkit.ingestion.parameter_table import ParameterTable, read_parameter_table
@@ -518,5 +519,4 @@ def _note_missing(name: str, out: Survey) -> None:
 
 
 def _listed(names: Sequence[str], most: int = 5) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return f"run{'s' if len(names) > 1 else ''} {', '.join(names[:most])}{more}"
+    return f"run{'s' if len(names) > 1 else ''} {listed(names, most)}"
