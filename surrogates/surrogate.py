@@ -24,8 +24,14 @@ from surrogates.record import Fit, Record
 from surrogates.settings import Settings
 from surrogates.uncertainty import Band, Beliefs
 
-# Samples predicted at once.
-_CHUNK = 512
+# Samples predicted at once, and how many nodes they may have together.
+_CHUNK, _AT_ONCE = 512, 1 << 21
+
+
+def _chunk(n_nodes: int) -> int:
+    return max(1, min(_CHUNK, _AT_ONCE // n_nodes))
+
+
 _NAMES = {"podnn": "PODNN", "aenn": "AENN", "gaenn": "GAENN", "pod-gpr": "POD-GPR", "pod-rbf": "POD-RBF"}
 
 
@@ -127,7 +133,9 @@ class Surrogate:
             return self.core.reconstruct(x, number)
         core = self.core
         with torch.no_grad():
-            parts = [core.reconstruct(part.transpose(0, 1), number) for part in torch.from_numpy(x).split(_CHUNK)]
+            parts = [
+                core.reconstruct(part.transpose(0, 1), number) for part in torch.from_numpy(x).split(_chunk(x.shape[1]))
+            ]
         return torch.cat([part.transpose(0, 1) for part in parts]).contiguous().numpy()
 
     def encode(self, states: ArrayLike, level: int | None = None) -> NDArray[np.float32]:
@@ -138,7 +146,10 @@ class Surrogate:
             return self.core.encode(x)
         core = self.core
         with torch.no_grad():
-            parts = [core.encode_metres(part.transpose(0, 1), number) for part in torch.from_numpy(x).split(_CHUNK)]
+            parts = [
+                core.encode_metres(part.transpose(0, 1), number)
+                for part in torch.from_numpy(x).split(_chunk(x.shape[1]))
+            ]
         return torch.cat(parts).numpy()
 
     def _states(self, states: ArrayLike, number: int) -> NDArray[np.float32]:
@@ -300,13 +311,13 @@ class Surrogate:
         end: Callable[[Tensor], Tensor] = lambda states: states.transpose(0, 1).contiguous(),
     ) -> NDArray[np.float32]:
         """(batch, state, node, 3); `end` makes (b, node, 3) of states (node, b, 3)."""
-        core = self.core
+        core, some = self.core, _chunk(self.graphs.n_nodes(number))
         at = torch.from_numpy(np.repeat(parameters, len(time), axis=0))
         when = torch.from_numpy(np.tile(time, len(parameters)))
         with torch.no_grad():
             parts = [
                 end(core(a, t, number))  # type: ignore[operator]
-                for a, t in zip(at.split(_CHUNK), when.split(_CHUNK), strict=True)
+                for a, t in zip(at.split(some), when.split(some), strict=True)
             ]
         out = (parts[0] if len(parts) == 1 else torch.cat(parts)).numpy()
         return out.reshape(len(parameters), len(time), *out.shape[1:])

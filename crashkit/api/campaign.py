@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 _log = logging.getLogger(__name__)
 
+# Bytes of a level's displacements up to which they are read at once.
+_AT_ONCE = 128 << 20
+
 if TYPE_CHECKING:
     import numpy as np
     import xarray as xr
@@ -32,6 +35,20 @@ class RunField:
 
         with self._source.opened() as dataset, reading_dataset(self._source.name):
             values: NDArray[np.float32] = dataset["displacement"].isel(sim=self._runs[run]).values
+        return values
+
+
+class LevelField:
+    """Displacements (sim, state, node of a level, 3) of chosen runs, m, from the dataset's stored hierarchy, run by run."""
+
+    def __init__(self, path: Path, level: int, runs: Sequence[int], shape: tuple[int, int]) -> None:
+        self._path, self._level, self._runs = path, level, list(runs)
+        self.shape = (len(self._runs), *shape, 3)
+
+    def __getitem__(self, run: int) -> NDArray[np.float32]:
+        from crashkit.mesh.store import level_displacement
+
+        values: NDArray[np.float32] = level_displacement(self._path, self._level, [self._runs[run]])[0]
         return values
 
 
@@ -81,6 +98,9 @@ def open_campaign(
         if level == 0:
             return field
         if source.stored and source.path is not None:
+            shape = (states, levels[level - 1].n_nodes)
+            if 12 * len(chosen) * states * shape[1] > _AT_ONCE:
+                return LevelField(source.path, level, chosen, shape)
             return level_displacement(source.path, level, chosen)
         kept = levels[level - 1].kept
         return np.stack([field[run][:, kept] for run in range(len(chosen))])

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from surrogates.data.campaign import Campaign
 from surrogates.data.inputs import Ranges
+from surrogates.data.shelf import Shelf, States, StoredStates
 from surrogates.errors import SurrogateError
 from surrogates.settings import Settings
 
@@ -110,6 +111,17 @@ def everything(campaign: Campaign, settings: Settings) -> ValidationSplit:
     return ValidationSplit(runs, named)
 
 
+@dataclass(frozen=True)
+class Seen:
+    """What states are like: the largest displacement in the first states and in all, m; their mean square, m^2; and of
+    each state the RMS over the runs, (state,), m, of all states whether known or not."""
+
+    first: float
+    largest: float
+    mean_square: float
+    course: NDArray[np.float64]
+
+
 class LevelRuns:
     """The displacements of one level, or of some of its `nodes`, run by run: checked, and never all at once unless asked."""
 
@@ -157,6 +169,27 @@ class LevelRuns:
         for k, run in enumerate(runs):
             out[k * self.states : (k + 1) * self.states] = torch.from_numpy(self.read(run)).transpose(1, 2)
         return out
+
+    def gathered(self, runs: NDArray[np.int64], known: NDArray[np.bool_] | None = None) -> tuple[States, Seen]:
+        """The states (sample, 3, node) of `runs` that are `known` (run, state), and what they are like as they pass.
+
+        They are in memory, or in a temporary file where they are many.
+        """
+        keep = np.ones((len(runs), self.states), bool) if known is None else known
+        shelf = Shelf(int(keep.sum()), (3, self.nodes))
+        squares, first, largest, row = np.zeros((len(runs), self.states)), 0.0, 0.0, 0
+        for k, run in enumerate(runs):
+            values = self.read(run)
+            squares[k] = [np.mean(np.square(state, dtype=np.float64)) for state in values]
+            first = max(first, float(np.abs(values[0]).max()))
+            some = values[keep[k]]
+            largest = max(largest, float(np.abs(some).max(initial=0.0)))
+            shelf.put(row, some.transpose(0, 2, 1))
+            row += len(some)
+        states = StoredStates(shelf) if shelf.array is None else torch.from_numpy(shelf.array)
+        mean = float(squares[keep].mean()) if row else 0.0
+        course = np.sqrt(squares.mean(axis=0)) if len(runs) else np.zeros(self.states)
+        return states, Seen(first, largest, mean, course)
 
     def _held(self, values: NDArray[np.float32], bad: NDArray[np.bool_], run: int) -> NDArray[np.float32]:
         state, node = np.argwhere(bad)[0]

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogates.data.campaign import Campaign
+from surrogates.data.campaign import Campaign, RunByRun
 from surrogates.data.samples import LevelRuns, Notes, ValidationSplit
+from surrogates.data.shelf import Shelf
 from surrogates.physics.clock import Clock
 from surrogates.physics.derived import DerivedInputs
 from surrogates.physics.symmetry import Symmetry
@@ -79,7 +80,7 @@ class Registration:
             parameter_names=told,
             parameter_units=("1",) * len(told),
             time=self.grid,
-            displacement=lambda level: _RegisteredField(self, campaign, settings, notes, level),
+            displacement=_RegisteredFields(self, campaign, settings, notes),
             runs=names if self.symmetry.is_identity else (*names, *(f"{name} {SIDE}" for name in names)),
             dimensions=(),
             mirrors=(),
@@ -156,27 +157,67 @@ class Registration:
         )
 
 
-class _RegisteredField:
-    """Displacements (run and image, state of the grid, node of a level, 3), m, run by run."""
+class _RegisteredFields:
+    """The displacements of every level, registered: (run and image, state of the grid, node of a level, 3), m.
 
-    def __init__(
-        self, registration: Registration, campaign: Campaign, settings: Settings, notes: Notes, level: int
-    ) -> None:
-        self._of, self._campaign = registration, campaign
-        mirrors = not registration.symmetry.is_identity
-        self._own = LevelRuns(campaign, level, settings, notes)
-        # An image is put together from the full mesh: mirrored nodes of a level lie between nodes the level lacks.
-        self._full = LevelRuns(campaign, 0, settings, notes) if mirrors and level else self._own
-        self._nodes = campaign.levels[level - 1].kept if level else None
-        count = len(campaign.parameters)
-        self.shape = (count * (1 + mirrors), len(registration.grid), self._own.nodes, 3)
-        self._count = count
+    A coarser level's nodes are nodes of level 1, and what is asked of that is kept: to make an image, the run is read
+    on the full mesh, since mirrored nodes of a level lie between nodes the level lacks.
+    """
+
+    def __init__(self, registration: Registration, campaign: Campaign, settings: Settings, notes: Notes) -> None:
+        self._of, self._campaign, self._settings, self._notes = registration, campaign, settings, notes
+        self._levels: dict[int, _RegisteredField] = {}
+
+    def __call__(self, level: int) -> RunByRun:
+        if level > 1:
+            return _Some(self(1), np.searchsorted(self._campaign.levels[0].kept, self._campaign.levels[level - 1].kept))
+        if level not in self._levels:
+            own = LevelRuns(self._campaign, level, self._settings, self._notes)
+            mirrors = not self._of.symmetry.is_identity
+            full = LevelRuns(self._campaign, 0, self._settings, self._notes) if mirrors and level else own
+            kept = self._campaign.levels[level - 1].kept if level else None
+            self._levels[level] = _RegisteredField(self._of, self._campaign, own, full, kept, keep=level == 1)
+        return self._levels[level]
+
+
+@dataclass(frozen=True)
+class _Some:
+    """Some `places` among the nodes of a `field`, run by run."""
+
+    field: RunByRun
+    places: NDArray[np.int64]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return (*self.field.shape[:2], len(self.places), 3)
 
     def __getitem__(self, run: int, /) -> NDArray[np.float32]:
-        of, parameters = self._of, self._campaign.parameters
-        if run < self._count:
-            states = self._own.read(run)
-        else:
-            run -= self._count
-            states = of.symmetry.apply(self._full.read(run), self._nodes)
-        return np.asarray(of.clock.apply(states, parameters[run], self._campaign.time, of.grid), np.float32)
+        return np.take(self.field[run], self.places, axis=1)
+
+
+class _RegisteredField:
+    """Displacements of one level, run by run, from those of the level and, for images, of the full mesh."""
+
+    def __init__(
+        self, registration: Registration, campaign: Campaign, own: LevelRuns, full: LevelRuns,
+        kept: NDArray[np.int64] | None, *, keep: bool,
+    ) -> None:  # fmt: skip
+        self._of, self._campaign, self._own, self._full, self._kept = registration, campaign, own, full, kept
+        self._count = len(campaign.parameters)
+        count = self._count * (1 if registration.symmetry.is_identity else 2)
+        self.shape = (count, len(registration.grid), own.nodes, 3)
+        self._shelf = Shelf(count, self.shape[1:]) if keep else None
+        self._there = np.zeros(count, bool)
+
+    def __getitem__(self, run: int, /) -> NDArray[np.float32]:
+        if self._shelf is None:
+            return self._made(run)
+        if not self._there[run]:
+            self._shelf.put(run, self._made(run)[None])
+            self._there[run] = True
+        return self._shelf.take(np.array([run])).reshape(self.shape[1:])
+
+    def _made(self, run: int) -> NDArray[np.float32]:
+        of, parameters, own = self._of, self._campaign.parameters, run % self._count
+        states = self._own.read(run) if run == own else of.symmetry.apply(self._full.read(own), self._kept)
+        return np.asarray(of.clock.apply(states, parameters[own], self._campaign.time, of.grid), np.float32)

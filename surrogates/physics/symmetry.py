@@ -19,6 +19,8 @@ from scipy import sparse
 from surrogates.data.campaign import Mirror
 
 # Parameters that may be odd and are tried in all combinations.
+# States that are mirrored at once.
+_STATES = 16
 _TRIED = 3
 
 
@@ -87,12 +89,14 @@ def mirrored(
     mirror: Mirror, states: NDArray[np.float32], nodes: NDArray[np.int64] | None = None
 ) -> NDArray[np.float32]:
     """(state, node, 3): the image of states (state, node of the full mesh, 3) in `mirror`, on `nodes` (default: all)."""
-    rows = mirror.to_image if nodes is None else mirror.to_image[nodes]
-    rows = rows.astype(states.dtype)
-    count = len(states)
-    flat = rows @ states.transpose(1, 0, 2).reshape(states.shape[1], -1)
-    turned = flat.reshape(-1, count, 3) @ mirror.reflection.T.astype(states.dtype)
-    return np.ascontiguousarray(turned.transpose(1, 0, 2))
+    rows = (mirror.to_image if nodes is None else mirror.to_image[nodes]).astype(states.dtype)
+    turn = mirror.reflection.T.astype(states.dtype)
+    out = np.empty((len(states), rows.shape[0], 3), states.dtype)
+    for k in range(0, len(states), _STATES):  # some at a time: their copies by node are as large as they are
+        some = states[k : k + _STATES]
+        flat = rows @ some.transpose(1, 0, 2).reshape(some.shape[1], -1)
+        out[k : k + _STATES] = (flat.reshape(-1, len(some), 3) @ turn).transpose(1, 0, 2)
+    return out
 
 
 def may_be_odd(names: Sequence[str], parameters: NDArray[np.float64]) -> list[tuple[str, ...]]:

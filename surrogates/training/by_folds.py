@@ -28,7 +28,7 @@ from surrogates.record import Fit
 from surrogates.reductions.reduction import LinearReduction
 from surrogates.settings import LevelSettings, Settings
 from surrogates.surrogate import level_name
-from surrogates.training.objectives import LevelObjective
+from surrogates.training.objectives import LevelObjective, chunk
 from surrogates.training.regression import Chosen, Latents, choose_regression, left_out_by_process
 from surrogates.training.trainer import Trainer
 
@@ -108,7 +108,11 @@ class FoldTrainer(Trainer):
             ) -> NDArray[np.float32]:
                 at = torch.from_numpy(between(course, grid, time))
                 with torch.no_grad():
-                    return in_metres(level.decode(at), level.scale).transpose(0, 1)[None].numpy()
+                    parts = [
+                        in_metres(level.decode(some), level.scale).transpose(0, 1)
+                        for some in at.split(chunk(level.n_nodes))
+                    ]
+                return torch.cat(parts)[None].numpy()
 
             yield self.registration.undo(said, self.original.parameters[run : run + 1], self.original.time)[0]
 
@@ -189,10 +193,16 @@ class FoldTrainer(Trainer):
             known = torch.from_numpy(np.asarray(self.campaign.known)).to(self.device)
         z, lost, states = [], 0.0, 0
         for run in everyone:
-            x = (torch.from_numpy(runs.read(int(run))).transpose(0, 1) / level.scale).to(self.device)
-            z.append(level.encode(x))
-            wrong = (x - level.decode(z[-1])).square().mean(dim=(0, 2))[known[run]]
-            lost, states = lost + float(wrong.sum()), states + len(wrong)
+            encoded = []
+            for some, counts in zip(
+                torch.from_numpy(runs.read(int(run))).split(chunk(level.n_nodes)),
+                known[run].split(chunk(level.n_nodes)), strict=True,
+            ):  # fmt: skip
+                x = (some.transpose(0, 1) / level.scale).to(self.device)
+                encoded.append(level.encode(x))
+                wrong = (x - level.decode(encoded[-1])).square().mean(dim=(0, 2))[counts]
+                lost, states = lost + float(wrong.sum()), states + len(wrong)
+            z.append(torch.cat(encoded))
         values = torch.stack(z)
         below = None
         if level.coarse is not None:

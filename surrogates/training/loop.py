@@ -43,6 +43,10 @@ class Objective(nn.Module):
         """Losses (2,) over the validation samples; None where there are none."""
         raise NotImplementedError
 
+    def pieces(self, batch: int) -> int:
+        """Into how many pieces a batch of so many samples is cut, one gradient after the other being added up."""
+        return 1
+
     def networks(self) -> dict[str, nn.Module]:
         """What is trained, by name; their tensors are what best weights and checkpoints hold."""
         raise NotImplementedError
@@ -119,7 +123,8 @@ def fit(
     if keeper is not None and (stored := keeper.load(name)) is not None:
         best = _restore(stored, names, optimiser, trained, out)
     weights = torch.tensor([settings.weight_approximation, settings.weight_reconstruction], device=device)
-    step = _Step(_distributed(objective), optimiser, weights, settings.clip, precision)
+    cut = 1 if torch.distributed.is_initialized() else objective.pieces(plan.batch)
+    step = _Step(_distributed(objective), optimiser, weights, settings.clip, precision, cut)
     started, spent = time.perf_counter(), out.seconds
     try:
         for epoch in range(out.epochs, settings.epochs):
@@ -230,24 +235,27 @@ class _Step:
     """One step of the optimiser; gives the losses (2,) of its batch, still on the device."""
 
     def __init__(
-        self, objective: nn.Module, optimiser: torch.optim.Optimizer, weights: Tensor, clip: float, precision: str
-    ) -> None:
+        self, objective: nn.Module, optimiser: torch.optim.Optimizer, weights: Tensor, clip: float, precision: str,
+        pieces: int = 1,
+    ) -> None:  # fmt: skip
         self.objective, self.optimiser, self.weights, self.clip = objective, optimiser, weights, clip
-        self.half = precision == "bfloat16"
+        self.half, self.pieces = precision == "bfloat16", pieces
         self.parameters = [p for group in optimiser.param_groups for p in group["params"]]
 
     def __call__(self, indices: Tensor, rate: float) -> Tensor:
         for group in self.optimiser.param_groups:
             group["lr"] = rate * group["factor"]
         self.optimiser.zero_grad(set_to_none=True)
-        with torch.autocast(indices.device.type, torch.bfloat16) if self.half else contextlib.nullcontext():
-            losses = self.objective(indices)
-        (losses * self.weights).sum().backward()
+        losses = torch.zeros_like(self.weights)
+        for part in indices.tensor_split(self.pieces):
+            with torch.autocast(indices.device.type, torch.bfloat16) if self.half else contextlib.nullcontext():
+                of_part = self.objective(part) * (len(part) / len(indices))
+            (of_part * self.weights).sum().backward()
+            losses += of_part.detach()
         if self.clip:
             nn.utils.clip_grad_norm_(self.parameters, self.clip)
         self.optimiser.step()
-        result: Tensor = losses.detach()
-        return result
+        return losses
 
 
 def _optimiser(objective: Objective, settings: LevelSettings, device: torch.device) -> torch.optim.Optimizer:

@@ -8,27 +8,39 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from surrogates.data.shelf import States
 from surrogates.errors import SurrogateError
 from surrogates.models.level import Known, LevelNetwork
 from surrogates.models.unified import Unified
 from surrogates.reductions.reduction import linear_part
 from surrogates.training.loop import Objective
 
-# Samples handled at once outside training.
-CHUNK = 512
+# Samples handled at once outside training, and how many nodes they may have together: the widest convolutions hold some
+# seventy numbers for each.
+_CHUNK, _NODES = 512, 1 << 19
+
+
+def chunk(n_nodes: int) -> int:
+    """How many samples of `n_nodes` nodes are handled at once outside training."""
+    return max(1, min(_CHUNK, _NODES // n_nodes))
+
+
+def pieces(batch: int, n_nodes: int) -> int:
+    """Into how many pieces a batch is cut, so that what a gradient needs stays small."""
+    return max(1, -(-batch * n_nodes // _NODES))
 
 
 @dataclass
 class Samples:
     """Samples of one level on a device.
 
-    states     (sample, 3, node), in the level's unit
+    states     (sample, 3, node), in the level's unit; read from a file where they are many
     inputs     (sample, inputs)
     encoded    (sample, coarse latent) and regressed likewise: what the frozen levels say, or None
     initial    (run, 3, node) first states and `run` (sample,), where the regression reads them
     """
 
-    states: Tensor
+    states: States
     inputs: Tensor
     encoded: Tensor | None = None
     regressed: Tensor | None = None
@@ -37,6 +49,19 @@ class Samples:
 
     def __len__(self) -> int:
         return len(self.inputs)
+
+    @property
+    def in_memory(self) -> Tensor:
+        """The states as a tensor.
+
+        Raises
+        ------
+        SurrogateError
+            Where they are in a file.
+        """
+        if not isinstance(self.states, Tensor):
+            raise SurrogateError("these states are in a file, and are read a batch at a time; expected few enough")
+        return self.states
 
     def batch(self, index: Tensor) -> tuple[Tensor, Tensor, Known, Tensor | None]:
         """States (node, b, 3), inputs, what is known, and first states (node, b, 3) of samples `index`."""
@@ -48,11 +73,12 @@ class Samples:
         if self.initial is not None and self.run is not None:
             which = self.run[index] if len(self.initial) > 1 else torch.zeros(1, dtype=torch.int64)
             initial = as_states(self.initial[which.to(self.initial.device)])
-        return as_states(self.states[index]), self.inputs[index], known, initial
+        return as_states(self.states[index].to(self.inputs.device)), self.inputs[index], known, initial
 
     def chunks(self) -> Iterator[Tensor]:
-        """Sample numbers, a few hundred at a time."""
-        return iter(torch.arange(len(self), device=self.inputs.device).split(CHUNK))
+        """Sample numbers, a few hundred at a time, or fewer where states are large."""
+        nodes = 1 if isinstance(self.states, Tensor) and self.states.ndim < 3 else self.states[:1].shape[-1]
+        return iter(torch.arange(len(self), device=self.inputs.device).split(chunk(nodes)))
 
 
 def as_states(rows: Tensor) -> Tensor:
@@ -80,6 +106,9 @@ class LevelObjective(Objective):
 
     def networks(self) -> dict[str, nn.Module]:
         return {"level": self.level}
+
+    def pieces(self, batch: int) -> int:
+        return pieces(batch, self.level.n_nodes)
 
     def forward(self, index: Tensor) -> Tensor:
         return self._losses(self.training_samples, index)
@@ -146,7 +175,7 @@ class LatentObjective(Objective):
 
     def latents(self) -> tuple[Tensor, Tensor]:
         """As in `LevelObjective`."""
-        return self.training_samples.inputs, self.training_samples.states[:, 0]
+        return self.training_samples.inputs, self.training_samples.in_memory[:, 0]
 
     def latent_sizes(self) -> Tensor:
         """As in `LevelObjective`."""
@@ -155,7 +184,7 @@ class LatentObjective(Objective):
     def _losses(self, samples: Samples, index: Tensor, rest: Tensor) -> Tensor:
         known = Known()
         z = self.level.regress(samples.inputs[index], known)
-        wrong = ((samples.states[index, 0] - z).square() @ self.weight).mean()
+        wrong = ((samples.in_memory[index, 0] - z).square() @ self.weight).mean()
         left = rest[index].mean()
         return torch.stack([left + wrong, left]).float()
 

@@ -29,6 +29,8 @@ from surrogates.uncertainty import FEWEST_BY_FOLDS, FEWEST_RUNS, Beliefs, calibr
 
 # Bytes of one run on the full mesh up to which lifted predictions are judged.
 _LARGEST_RUN = 2 << 30
+# States whose distances are worked out at once.
+_STATES = 8
 
 
 def train_surrogate(
@@ -246,7 +248,7 @@ def _judge(surrogate: Surrogate, trainer: Trainer) -> None:
         def lifted(number: int = number) -> Iterator[_Judged]:
             for run, predicted in _left_out(surrogate, trainer, number):
                 if full is not None:
-                    yield run, _off(surrogate.lift(predicted, number), full, run)
+                    yield run, _off(predicted, full, run, lambda some: surrogate.lift(some, number))
 
         _note(surrogate, trainer, name, (number, False), own())
         if full is not None and number > 0:
@@ -336,11 +338,26 @@ def _predicted(surrogate: Surrogate, campaign: Campaign, run: int, number: int) 
     return surrogate.predict(campaign.parameters[run], campaign.time, number)
 
 
-def _off(said: NDArray[np.float32], runs: LevelRuns, run: int) -> NDArray[np.float32]:
-    """(state, node), m: how far `said` is from the truth of a run; NaN where the node is gone, which no error counts."""
-    distance = np.asarray(np.linalg.norm(said - runs.read(run), axis=-1))
+def _off(
+    said: NDArray[np.float32],
+    runs: LevelRuns,
+    run: int,
+    lifted: Callable[[NDArray[np.float32]], NDArray[np.float32]] = lambda some: some,
+) -> NDArray[np.float32]:
+    """(state, node), m: how far `said` is from the truth of a run; NaN where the node is gone, which no error counts.
+
+    Parameters
+    ----------
+    lifted
+        Brings some states of `said` to the nodes of `runs`; not many of them are in memory at once.
+    """
+    truth = runs.read(run)
+    out = np.empty(truth.shape[:2], np.float32)
+    for k in range(0, len(truth), _STATES):
+        some = slice(k, k + _STATES)
+        out[some] = np.linalg.norm(lifted(said[some]) - truth[some], axis=-1)
     there = runs.there(run)
-    return distance if there is None else np.where(there, distance, np.float32(np.nan))
+    return out if there is None else np.where(there, out, np.float32(np.nan))
 
 
 def _mean(distance: NDArray[np.float32]) -> float:

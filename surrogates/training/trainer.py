@@ -14,6 +14,7 @@ from surrogates.data.campaign import Campaign
 from surrogates.data.graphs import Graphs
 from surrogates.data.inputs import InputScaling
 from surrogates.data.samples import LevelRuns, Notes, ValidationSplit, scale_of
+from surrogates.data.shelf import States, divide
 from surrogates.models.cascade import Cascade, build_level
 from surrogates.models.level import LevelNetwork
 from surrogates.models.unified import Unified
@@ -25,7 +26,7 @@ from surrogates.settings import LevelSettings, Settings
 from surrogates.surrogate import Surrogate, level_name
 from surrogates.training.loop import Epoch, Keeper, Objective, set_up
 from surrogates.training.loop import fit as run_epochs
-from surrogates.training.objectives import CHUNK, LatentObjective, LevelObjective, Samples, UnifiedObjective, as_states
+from surrogates.training.objectives import LatentObjective, LevelObjective, Samples, UnifiedObjective, as_states, chunk
 from surrogates.training.starts import pod_start, start_level, start_unified
 
 # Share of the largest displacement below which a first state is undeformed.
@@ -68,7 +69,7 @@ class Trainer:
         runs = self.runs(finest, graphs)
         states, held = (runs.samples(part) for part in self._parts)
         network.scale = _divide_by_rms(states, held)
-        start_unified(network, lambda: map(as_states, states.split(CHUNK)))
+        start_unified(network, lambda: map(as_states, states.split(chunk(network.n_nodes))))
         network.to(self.device)
         inputs, held_inputs = (self.inputs(network.inputs, part) for part in self._parts)
         training, validation = (
@@ -126,31 +127,34 @@ class Trainer:
 
         alone  the reduction is trained without the regression
         """
-        states, held = (runs.samples(part) for part in (training, validation))
-        count = len(self.campaign.time)
-        first, course = states[::count].abs().max(), _course(states, count)
         keep, keep_held = (self._known(part) for part in (training, validation))
-        if keep is not None and keep_held is not None:
-            states, held = states[keep], held[keep_held]
-        level.scale = _divide_by_rms(states, held)
-        self._rest(level, scaling, first / level.scale, states.abs().max(), course)
+        states, seen = runs.gathered(training, keep)
+        held, _ = runs.gathered(validation, keep_held)
+        level.scale = scale_of(seen.mean_square)
+        for some in (states, held):
+            divide(some, level.scale)
+        first, largest, course = (
+            torch.tensor(of, dtype=torch.float32) for of in (seen.first, seen.largest, seen.course)
+        )
+        self._rest(level, scaling, first / level.scale, largest / level.scale, course)
         linear = linear_part(level.reduction)
         if linear is not None:
-            start_level(level, linear, lambda: map(as_states, states.split(CHUNK)))
+            start_level(level, linear, lambda: map(as_states, states.split(chunk(level.n_nodes))))
         level.to(self.device)
         if alone:
             level.regressor.requires_grad_(False)
         inputs, held_inputs = (self.inputs(scaling, part) for part in (training, validation))
         if keep is not None and keep_held is not None:
-            inputs, held_inputs = inputs[keep.to(inputs.device)], held_inputs[keep_held.to(inputs.device)]
+            inputs, held_inputs = (
+                x[torch.from_numpy(of.ravel()).to(x.device)] for x, of in ((inputs, keep), (held_inputs, keep_held))
+            )
         samples = self._samples(level, states, inputs, len(training))
         held_samples = self._samples(level, held, held_inputs, len(validation)) if len(held) else None
         return LevelObjective(level, samples, held_samples, reduction_alone=alone)
 
-    def _known(self, runs: NDArray[np.int64]) -> Tensor | None:
-        """(run * state,) states that were computed, where not all were."""
-        known = self.campaign.known
-        return None if known is None else torch.from_numpy(np.asarray(known)[runs].ravel())
+    def _known(self, runs: NDArray[np.int64]) -> NDArray[np.bool_] | None:
+        """(run, state) states that were computed, where not all were."""
+        return None if self.campaign.known is None else np.asarray(self.campaign.known)[runs]
 
     def _rest(self, level: LevelNetwork, scaling: InputScaling, first: Tensor, largest: Tensor, course: Tensor) -> None:
         """Where all runs start undeformed, as their `first` displacements say, predictions will.
@@ -204,9 +208,9 @@ class Trainer:
         )  # fmt: skip
 
     @torch.no_grad()
-    def _samples(self, level: LevelNetwork, states: Tensor, inputs: Tensor, runs: int) -> Samples:
+    def _samples(self, level: LevelNetwork, states: States, inputs: Tensor, runs: int) -> Samples:
         """Samples on the device, with what the frozen levels say of them."""
-        out = Samples(states.to(self.device), inputs)
+        out = Samples(states.to(self.device) if isinstance(states, Tensor) else states, inputs)
         if level.with_initial:
             out = self._with_initial(out, runs)
         if level.coarse is None:
@@ -243,11 +247,6 @@ class Trainer:
         time = torch.from_numpy(np.tile(self.campaign.time.astype(np.float64), len(runs)))
         result: Tensor = scaling(at, time).to(self.device)
         return result
-
-
-def _course(states: Tensor, count: int) -> Tensor:
-    """(state,): RMS of states (sim * state, 3, node) over the runs."""
-    return torch.stack([states[k::count].square().mean() for k in range(count)]).sqrt()
 
 
 def _divide_by_rms(states: Tensor, held: Tensor) -> float:
