@@ -132,6 +132,7 @@ class FoldTrainer(Trainer):
         held = np.flatnonzero(self.part[: self.own] == 0)
         if not any(parameter.requires_grad for parameter in level.parameters()):
             return level, 0, False
+        del level  # one at a time: on a large level it is most of what is in memory
         level = self._fresh(number, cascade, graphs)
         objective = self._alone(level, runs, cascade, everyone[self.part != 0], held)
         matters = _MATTERS * wrong / level.scale**2
@@ -146,6 +147,7 @@ class FoldTrainer(Trainer):
                 return level, tried.epochs, True
             best = tried.best / (settings.weight_approximation + settings.weight_reconstruction)
             epochs = tried.best_epoch if untrained - best > matters else 0
+        del level, objective
         level = self._fresh(number, cascade, graphs)
         objective = self._alone(level, runs, cascade, everyone)
         if not epochs:

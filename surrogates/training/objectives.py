@@ -15,9 +15,9 @@ from surrogates.models.unified import Unified
 from surrogates.reductions.reduction import linear_part
 from surrogates.training.loop import Objective
 
-# Samples handled at once outside training, and how many nodes they may have together: the widest convolutions hold some
-# seventy numbers for each.
-_CHUNK, _NODES = 512, 1 << 19
+# Samples handled at once outside training, and how many nodes they may have together: the widest convolution holds some
+# seventy numbers for each, a gradient some three hundred.
+_CHUNK, _NODES, _NODES_IN_TRAINING = 512, 1 << 17, 1 << 19
 
 
 def chunk(n_nodes: int) -> int:
@@ -27,7 +27,7 @@ def chunk(n_nodes: int) -> int:
 
 def pieces(batch: int, n_nodes: int) -> int:
     """Into how many pieces a batch is cut, so that what a gradient needs stays small."""
-    return max(1, -(-batch * n_nodes // _NODES))
+    return max(1, -(-batch * n_nodes // _NODES_IN_TRAINING))
 
 
 @dataclass

@@ -71,5 +71,6 @@ def test_training_from_a_file_in_pieces_gives_the_model_of_memory(monkeypatch: p
 
     whole = predicted()
     monkeypatch.setattr(module, "IN_MEMORY", 0)
-    monkeypatch.setattr(objectives, "_NODES", 64)  # so that batches, and what is encoded at once, are cut
+    for bound in ("_NODES", "_NODES_IN_TRAINING"):  # so that batches, and what is encoded at once, are cut
+        monkeypatch.setattr(objectives, bound, 64)
     np.testing.assert_allclose(predicted(), whole, rtol=1e-3, atol=1e-3 * np.abs(whole).max())
