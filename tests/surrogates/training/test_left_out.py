@@ -8,9 +8,12 @@ import numpy as np
 import plate
 import pytest
 
+from surrogates.physics.derived import SPEED, STRESS
 from surrogates.settings import settings
 from surrogates.storage.folder import load, save
+from surrogates.training import train
 from surrogates.training.train import train_surrogate
+from surrogates.uncertainty import Band, Beliefs, Gathered
 
 
 def test_every_run_is_left_out_once_and_its_error_and_deviation_are_kept(tmp_path: Path) -> None:
@@ -54,3 +57,27 @@ def test_validation_runs_train_nothing(model: str, overrides: tuple[str, ...]) -
     for name, level in one.level_names.items():
         np.testing.assert_array_equal(two.predict(mu, level=level), one.predict(mu, level=level))
         assert two.record.errors[name] != one.record.errors[name]
+
+
+@pytest.mark.parametrize(("model", "times"), [("pod-gpr", 2), ("podnn", 1)])
+def test_a_band_is_calibrated_on_each_left_out_run_by_what_the_model_says_of_it(
+    monkeypatch: pytest.MonkeyPatch, model: str, times: int
+) -> None:
+    """POD regression leaves each of few runs out twice: then it must not judge itself."""
+    given = []
+    real = train.calibrate_gathered
+
+    def noted(gathered: Gathered, time: np.ndarray, beliefs: Beliefs, runs: np.ndarray | None = None) -> Band:
+        given.append((beliefs, np.arange(len(gathered[2])) if runs is None else runs))
+        return real(gathered, time, beliefs, runs)
+
+    monkeypatch.setattr(train, "calibrate_gathered", noted)
+    campaign = plate.campaign(14, dimensions=(SPEED, None, STRESS))
+    chosen = settings(model, overrides=["level.epochs=1", "inputs.derived=off", "pod.modes=[4]", "validation.folds=4"])
+    surrogate = train_surrogate(campaign, chosen)
+    (beliefs, runs) = given[0]
+    assert sorted(runs.tolist()) == sorted(list(range(14)) * times)
+    assert not surrogate.registration.clock.is_identity
+    np.testing.assert_allclose(beliefs.size, surrogate.registration.clock.size(campaign.parameters[runs]))
+    assert (len(set(beliefs.deviation.tolist())) > 1) == (model == "pod-gpr")
+    assert surrogate.bands[0, False].runs == 14
