@@ -87,7 +87,7 @@ def reading_dataset(path: str | Path) -> Iterator[None]:
 
 
 def _damage(path: Path) -> str | None:
-    """Which run and chunk of a Zarr folder is damaged, if that can be told."""
+    """Which run and chunk of a Zarr folder is damaged; None where that cannot be found out."""
     if not path.is_dir():
         return None
     try:

@@ -61,7 +61,7 @@ def block_digest(block: NDArray[Any]) -> BlockDigest:
 def array_digest(blocks: Iterable[BlockDigest]) -> str | None:
     """SHA-256 of the digests of one run's array, in order.
 
-    None where all is the default: such an array is as good as absent, and left out of the run's checksum.
+    None where all is the default: an all-default array is treated as absent, and left out of the run's checksum.
     """
     found = list(blocks)
     if all(block.is_default for block in found):

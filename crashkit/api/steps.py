@@ -142,7 +142,7 @@ def _command(step: Step) -> str:
 
 @contextlib.contextmanager
 def _aside(result: Path) -> Iterator[None]:
-    """Out of the way what stands there; it comes back unless a new one takes its place."""
+    """Move what exists at `result` out of the way; it is put back unless a new one takes its place."""
     from data_schema.replace import remove
 
     old = result.with_name(f".{result.name}.before")

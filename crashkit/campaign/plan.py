@@ -73,7 +73,7 @@ class Design(_Strict):
 
 
 class Ingest(_Strict):
-    """What `crashkit ingest` is told about the runs."""
+    """Options of `crashkit ingest` for the runs."""
 
     units: str | None = None
     reader: str | None = None

@@ -44,7 +44,7 @@ app = typer.Typer(
 
 
 def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
-    """`command`, with failures the user can act on told in one line and exit code 1 instead of a traceback."""
+    """`command`, with failures the user can act on printed in one line and exit code 1 instead of a traceback."""
 
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> Any:

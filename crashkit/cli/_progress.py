@@ -4,7 +4,7 @@ All commands tell their progress in one shape, `step(what, done, total, note)`, 
 
     MH3 120/300 | validation 1.65 cm (best 1.65, epoch 21) | 38 s left
 
-The rooms below the command line say what they are at through `logging` (level INFO), so that none of them needs to know
+The packages below the command line say what they are doing through `logging` (level INFO), so that none of them needs to know
 who listens; such a line becomes the `what` of the work that follows.
 """
 
@@ -140,7 +140,7 @@ def _fitted(text: str) -> Any:
 
 
 class _Listener(logging.Handler):
-    """Turns what the rooms log into stages (INFO) and lines (WARNING and above)."""
+    """Turns what the packages log into stages (INFO) and lines (WARNING and above)."""
 
     def __init__(self, progress: Progress) -> None:
         super().__init__(logging.INFO)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 # More common times than this are a slip of the keyboard.
 _MOST_TIMES = 100_000
-# Marked runs that are told one by one.
+# Marked runs that are listed one by one.
 _MOST_MARKED = 10
 
 

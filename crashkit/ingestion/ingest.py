@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from crashkit.mesh.levels import Hierarchy
 
 
-# Runs beyond a limit that are told one by one.
+# Runs beyond a limit that are listed one by one.
 _TOLD = 5
 
 
@@ -445,7 +445,7 @@ def _attempt(todo: tuple[Found, str, Path], layout: Layout) -> _Outcome:
 
 @contextmanager
 def _what_is_kept(staging: Staging) -> Iterator[None]:
-    """Failures that say what of the work is not lost; a full disk and the like told as what they are."""
+    """Failures say which finished runs are kept; a full disk and the like are reported as what they are."""
 
     def kept() -> str:
         count = len(staging.runs)
@@ -540,7 +540,7 @@ def _hierarchy_of(former: Existing | None) -> Hierarchy | None:
 
 
 def _carried(output: Path, hierarchy: Hierarchy) -> str:
-    """Give the new dataset the hierarchy of the former one, with the displacements of all its runs; what is told of it.
+    """Give the new dataset the hierarchy of the former one, with the displacements of all its runs; returns the note about it.
 
     The selection depends on the mesh alone, which new runs share; where they replaced it, the hierarchy is gone.
     """

@@ -43,7 +43,7 @@ class Dead:
 
 
 def never_alive(run: Run) -> Dead | None:
-    """The elements of `run` that live in no state; None where all live in the first one, which is as good as always."""
+    """The elements of `run` that live in no state; None where all live in the first one, which is nearly always the case."""
     first = _alive(run, 0, 1)
     if all(flags is None or flags.all() for flags in first):
         return None

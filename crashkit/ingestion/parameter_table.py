@@ -109,7 +109,7 @@ def _one_form(name: str) -> str:
 
 
 def read_parameter_table(path: Path) -> ParameterTable:
-    """The table at `path`, told by its suffix.
+    """The table at `path`, read by its suffix.
 
     Raises
     ------
@@ -211,7 +211,7 @@ def _load(path: Path) -> _Table:
     kept = [k for k in range(width) if header[k] or any(_text(line[k]) for _, line in body)]
     doubled = next((c for c, times in Counter(header[k] for k in kept).items() if c and times > 1), None)
     if doubled is not None:
-        raise ReadError(f"{path}: column {doubled!r} stands there twice")
+        raise ReadError(f"{path}: column {doubled!r} appears twice")
     nameless = next((k for k in kept if not header[k]), None)
     if nameless is not None:
         raise ReadError(f"{path}: column {nameless + 1} has values and no name; name it in the header, or empty it")
@@ -299,7 +299,7 @@ def _json_rows(path: Path) -> list[tuple[int, list[Any]]]:
     def distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         twice = next((name for name, times in Counter(name for name, _ in pairs).items() if times > 1), None)
         if twice is not None:
-            raise ReadError(f"{path}: {twice!r} stands there twice in one object; keep one each")
+            raise ReadError(f"{path}: {twice!r} appears twice in one object; keep one each")
         return dict(pairs)
 
     data = json.loads(_decoded(path.read_bytes(), path), object_pairs_hook=distinct)

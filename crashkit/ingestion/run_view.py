@@ -32,7 +32,7 @@ class RunView:
         return _scaled(_gather(values, self.structure.node), self.system.length)
 
     def alive(self, first: int, last: int) -> tuple[Flags | None, Flags | None]:
-        """(state, face) and (state, cell), None where the run does not say; skin lives as long as its solid."""
+        """(state, face) and (state, cell), None where the run does not say; a skin face is alive while its solid is."""
         with reading(f"run {self.run.name}, life of elements in states {first} to {last - 1}"):
             shells, cells = self.run.alive(first, last), self.run.alive_cells(first, last)
         source = self.structure.face_source

@@ -99,7 +99,7 @@ class Staging:
             return False
 
     def _lines(self) -> list[dict[str, Any]]:
-        """Lines of the journal; one that was cut off is as good as not there."""
+        """Lines of the journal; one that was cut off is ignored."""
         if not self._journal.exists():
             return []
         out = []

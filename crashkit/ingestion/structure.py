@@ -131,7 +131,7 @@ def structure_of(
 
 
 def matched(reference: Structure, other: Structure) -> Structure:
-    """`other` with its nodes, faces and cells in the order of `reference`, told by their numbers.
+    """`other` with its nodes, faces and cells in the order of `reference`, matched by their numbers.
 
     Raises
     ------
@@ -151,7 +151,7 @@ def matched(reference: Structure, other: Structure) -> Structure:
             )
         by_id = np.argsort(other.node_id)
         order = by_id[np.searchsorted(other.node_id[by_id], reference.node_id)]
-    if _same_numbering(reference, other):  # as good as always, and much quicker than sorting all elements
+    if _same_numbering(reference, other):  # nearly always the case, and much quicker than sorting all elements
         return replace(
             reference,
             node=other.node,
@@ -313,7 +313,7 @@ def _stack(shells: NDArray[np.int32], skin: NDArray[np.int32]) -> NDArray[np.int
 
 
 def _repeated(ids: NDArray[np.int64]) -> int | None:
-    """A number that stands there more than once."""
+    """A number that appears more than once."""
     inorder = np.sort(ids)
     again = inorder[1:][np.diff(inorder) == 0]
     return int(again[0]) if len(again) else None

@@ -263,7 +263,7 @@ def each_run(source: Path, choice: Choice, out: Survey, stop: bool) -> Iterator[
 
 
 def reader_options(mesh: str | Path | None, time_step: float | None) -> tuple[tuple[str, str], ...]:
-    """What a reader is told beside the path, without what is not given; it refuses what it has no use for."""
+    """Options for a reader beside the path, without those not given; it refuses options that it does not have."""
     if mesh is not None and not Path(mesh).is_file():
         raise DataError(f"--mesh is {mesh}, which is no file; give a mesh file with the faces, or leave it out")
     given = {"mesh": mesh, "time_step": time_step}

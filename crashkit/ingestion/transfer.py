@@ -1,8 +1,9 @@
 """One run from its source into the staging folder: read by states, checked, changed to SI and to the common times,
 written by blocks of nodes.
 
-A reader gives some states of all nodes; a chunk holds all states of some nodes. The turn is made in memory while a
-run stays below `MEMORY_BYTES`, and through a scratch file where it does not, so memory does not grow with the run.
+A reader gives some states of all nodes; a chunk holds all states of some nodes. Arrays are transposed
+(state-major to node-major) in memory while a run stays below `MEMORY_BYTES`, and through a scratch file where it does not,
+so memory does not grow with the run.
 """
 
 from __future__ import annotations

@@ -76,7 +76,7 @@ def probe_map(
 
     points (n, 3), m; parts (n, words) bit sets; into (n,): coarse node that each fine node was contracted into, -1
     where the node is outside the graph and takes the nearest coarse node; coarse (k, 3); edges (e, 2) of the coarse
-    graph; same (k,): fine number of each coarse node, whose row is exactly 1 on itself.
+    graph; same (k,): fine index of each coarse node; its row of U is a unit row.
     """
     from crashkit.mesh import _closest
 

@@ -29,7 +29,7 @@ BOUNDARY = 10.0
 SPREAD = 0.005
 # A contraction costs this much more for every face it turns over.
 FLIP = 10.0
-# Fields are taken to turn over on this share of the mesh's diagonal when kept nodes change places.
+# Assumed length scale of the field, as a share of the mesh's diagonal, when kept nodes change places.
 CURVATURE = 0.2
 ROUNDS = 3
 # Close pairs: how much farther apart along the graph than through space, and how many neighbours are looked at.

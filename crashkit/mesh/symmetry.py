@@ -60,7 +60,7 @@ class MirrorPlane:
 
     @property
     def name(self) -> str:
-        """Such as "y = 0.012 m", or the normal where the plane is askew."""
+        """Such as "y = 0.012 m", or the normal where the plane is oblique."""
         axis = int(np.abs(self.normal).argmax())
         if self.normal[axis] > 1 - 1e-9:
             return f"{'xyz'[axis]} = {round(self.offset, 4) + 0.0:g} m"

@@ -271,7 +271,7 @@ class D3plotFile:
             kind = "plastic" if h.has_solid_shell_plastic_strain_tensor else "thermal"
             return {
                 "strain": f"shells hold {kind} strain tensors (IDTDT = {h.raw_header['idtdt']}, asked for by STRFLG of "
-                "*DATABASE_EXTENT_BINARY), which strains cannot be told from; compute the run without them"
+                "*DATABASE_EXTENT_BINARY), which cannot be distinguished from other values; compute the run without them"
             }
         why = (
             f"shells hold {h.n_shell_vars} words each, the header's output options (*DATABASE_EXTENT_BINARY) account for "

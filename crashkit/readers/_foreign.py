@@ -23,7 +23,7 @@ _BY_SUFFIX = {
     ".key": "is an LS-DYNA deck, not a result; name its d3plot",
     ".rad": "is an OpenRadioss deck, not a result; name its animation files or their folder",
 }
-# First bytes -> what the file is packed with; told only where no reader takes the file as it is.
+# First bytes -> what the file is packed with; reported only where no reader takes the file as it is.
 _PACKED = {
     b"\x1f\x8b": "gzip",
     b"PK\x03\x04": "ZIP",

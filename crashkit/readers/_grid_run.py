@@ -161,7 +161,7 @@ class GridRun(Run):
     def _offered(
         self, grid: Grid
     ) -> tuple[dict[str, tuple[Place, str, NDArray[np.bool_] | None]], dict[str, FieldInfo]]:
-        """Where each field is found: kind, name of its array, and the cells it is told for (None: all)."""
+        """Where each field is found: kind, name of its array, and the cells it is written for (None: all)."""
         arrays: dict[str, tuple[Place, str, NDArray[np.bool_] | None]] = {}
         fields: dict[str, FieldInfo] = {}
 
@@ -360,7 +360,7 @@ def _parts(
 
 
 def _element_kind(title: str) -> tuple[str, str]:
-    """Name of a cell array's field, and the elements it is told for: "1D", "2D", "3D", "SPH" or "" for all.
+    """Name of a cell array's field, and the elements it is written for: "1D", "2D", "3D", "SPH" or "" for all.
 
     OpenRadioss's converters write 2DELEM_Plastic_Strain or Plastic Strain_2D, and zeros on all other elements.
     """

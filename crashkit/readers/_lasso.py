@@ -89,7 +89,7 @@ class _Swallowed(logging.Handler):
 @cache
 def _swallowed() -> _Swallowed:
     # lasso-python configures the root logger when imported, which is for the application to do: this has to be the
-    # first import of it, so that what it adds can be told and taken away again.
+    # first import of it, so that what it adds is known and can be taken away again.
     root = logging.getLogger()
     before = list(root.handlers)
     from lasso.dyna import d3plot, d3plot_header

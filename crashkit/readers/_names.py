@@ -84,7 +84,7 @@ def field_name(title: str) -> str:
 
 
 def quantity(name: str) -> str:
-    """The quantity of the field `name`, told by its last words that are known; `name` itself where none is.
+    """The quantity of the field `name`, recognised by the last of its words that are known; `name` itself where none is.
 
     Solids, beams and the like carry their kind in front ("solid_plastic_strain"), surfaces and layers behind
     ("stress_upper"), and what comes last says what it is: a "plastic_strain_rate" is a rate.

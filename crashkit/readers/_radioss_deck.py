@@ -27,7 +27,7 @@ def decks(folder: Path, root: str) -> tuple[Path, ...]:
 
 
 def units(files: Sequence[Path]) -> str | None:
-    """The working unit system of the starter deck (/BEGIN), e.g. "mm-ms-kg"; None where it is not told."""
+    """The working unit system of the starter deck (/BEGIN), e.g. "mm-ms-kg"; None where the deck does not say."""
     for file in files:
         lines = _lines(file)
         for line in lines:

@@ -46,7 +46,7 @@ _ENDING = re.compile(r"d3(plot|part)$", re.IGNORECASE)
 _BESIDE = re.compile(r"d3(part|drlf|eigv|mode|iter)$", re.IGNORECASE)
 _DECK_SUFFIXES = (".k", ".key", ".dyn")
 _DECK_BYTES = 16 << 20
-# (kind, field, lasso-python's name, components); what stands in a file is told by its header.
+# (kind, field, lasso-python's name, components); the header says which of them a file holds.
 _ELEMENT_FIELDS = (
     ("solid", "stress", "element_solid_stress", 6),
     ("solid", "von_mises", "element_solid_stress", 1),
@@ -347,7 +347,7 @@ class _D3plotRun(Run):
     def _living(
         self, kinds: tuple[str, ...], nodes: NDArray[np.int32], first: int, last: int
     ) -> NDArray[np.bool_] | None:
-        """(state, element): element words other than zero; or, where nodes are told, elements with all their nodes.
+        """(state, element): element words other than zero; or, where nodes are marked instead, elements with all their nodes.
 
         Particles have a word of their own (`D3plotFile.particle_alive`).
         """

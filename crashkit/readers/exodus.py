@@ -286,7 +286,7 @@ class _Blocks(GridSource):
 
 
 class _Pieces(GridSource):
-    """A run in pieces, one file a processor: every node and element once, told by their numbers."""
+    """A run in pieces, one file a processor: every node and element once, matched by their numbers."""
 
     def __init__(self, files: list[Path]) -> None:
         found = {int(m["number"]): file for file in files if (m := _PIECE.fullmatch(file.name))}

@@ -251,7 +251,7 @@ class _Campaign:
         return ReadError(f"{self.path}: {found.name} has shape {found.shape}, expected {expected}")
 
     def read(self, dataset: h5py.Dataset, *index: Any) -> NDArray[Any]:
-        """`dataset[index]`, with damage on the disk told by name and place."""
+        """`dataset[index]`, with damage on the disk as an error that names file and place."""
         with reading(f"{self.path}, {dataset.name}{list(index)}"):
             return np.asarray(dataset[index])
 

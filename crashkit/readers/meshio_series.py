@@ -1,6 +1,6 @@
 """XDMF time series, and numbered files of every format that meshio reads.
 
-XDMF is told by its content. Other formats are read when this reader is asked for by name: files that differ by a
+XDMF is recognised by its content. Other formats are read when this reader is asked for by name: files that differ by a
 number in their name are the states of a run, and the option `time_step` gives the time between two of them, since
 they hold none.
 """

@@ -11,7 +11,7 @@ Where times are missing, the option `time_step` gives the time between two state
 
 A trap: some versions take the positions of a d3plot for displacements. Where displacement_t of the first state is
 the reference position instead of zero, the arrays are read as positions, with a warning in the log. In a Zarr store
-made that way the positions are sums of two, which cannot be told from the store.
+made that way the positions are sums of two, which cannot be detected.
 """
 
 from __future__ import annotations

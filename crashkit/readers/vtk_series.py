@@ -3,7 +3,7 @@
 A run is a `.pvd`; or a `.series` list as ParaView writes it; or files that differ by a number in their name
 (run_0000.vtu, kartA001.vtk), each with its time in the field data (TimeValue, or TIME as OpenRadioss's converter to
 legacy VTK writes it). Where files hold no times, the option `time_step` gives the time between two of them. VTU and
-VTP are read by VTK, legacy files here (both for reasons told in the modules that do it).
+VTP are read by VTK, legacy files here (the modules that do it say why).
 
 A state may lie in several files: the blocks of a VTM become parts, and the pieces of a PVTU, which solvers write on
 several processors, are joined by their global node numbers.
@@ -280,7 +280,7 @@ def _joined(pieces: Sequence[tuple[Leaf, Grid]]) -> Grid:
 
 
 def _merged(joined: Grid, ids: str, place: str, domains: bool) -> Grid | None:
-    """Pieces with every node once, told by the numbers `ids`; None where the pieces share no node.
+    """Pieces with every node once, matched by the numbers `ids`; None where the pieces share no node.
 
     Numbers that mean another place in another piece are those of blocks that count on their own: an error in
     `domains`, no reason to join elsewhere.

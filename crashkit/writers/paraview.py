@@ -674,7 +674,7 @@ class _Disk(FileIO):
     """A file for HDF5 that remembers what went wrong instead of saying so.
 
     When writing fails, on a full disk, HDF5 cannot close its file any more and takes the interpreter with it. So
-    it is told that all went well until it has closed the file, and `check` says what really happened.
+    it is made to believe that all went well until it has closed the file; `check` then raises what really happened.
     """
 
     error: OSError | None = None

@@ -13,7 +13,7 @@ SIZES = (12, 24, 48)  # fewer training runs, for the learning curves
 
 @dataclass(frozen=True)
 class Kind:
-    """One model of the table: what `crashkit train` is told beside data, split and seed."""
+    """One model of the table: options of `crashkit train` beside data, split and seed."""
 
     name: str
     model: str
@@ -44,7 +44,7 @@ class Job:
 
 
 # The fast preset was chosen on the small campaign of the demo. Here there are four times as many states for each epoch,
-# so fewer epochs do; and a network that sees 84 runs a hundred times learns them by heart unless its weights are held
+# so fewer epochs do; and a network that sees 84 runs a hundred times overfits unless its weights are held
 # down. Both were chosen for the coarsest level on validation runs, and hold for every network of the table, as do the
 # inputs: speed, angle, yield stress, time, products with the time, sine and cosine of the angle.
 COMMON = ("level.epochs=75", "level.weight_decay=0.1", "inputs.products=true", "inputs.angles=true")
@@ -94,7 +94,7 @@ def _with_epochs(kind: Kind, epochs: Callable[[int], int]) -> tuple[str, ...]:
 
 
 def quick(kind: Kind) -> Kind:
-    """The same for a coffee break: an eighth of the epochs."""
+    """A short version for trials: an eighth of the epochs."""
     return replace(kind, settings=_with_epochs(kind, lambda n: max(2, n // 8)))
 
 

@@ -75,7 +75,7 @@ def test_run_without_row_is_told_by_name(tmp_path: Path) -> None:
         ("runs.csv", "run,a\n,3\n", ReadError, "row 2 names no run"),
         ("runs.csv", "run,a\n", ReadError, "the table has no row"),
         ("runs.csv", "", ReadError, "cannot be read as a table"),
-        ("runs.csv", "run,a,a\nx,1,2\n", ReadError, "column 'a' stands there twice"),
+        ("runs.csv", "run,a,a\nx,1,2\n", ReadError, "column 'a' appears twice"),
         ("runs.json", '{"x": 3}', ReadError, "expected a list of rows"),
         ("runs.json", "[{", ReadError, "cannot be read as a table"),
         ("runs.xlsx", "no workbook", ReadError, "cannot be read as a table"),
@@ -206,7 +206,7 @@ def test_runs_find_their_rows_by_number_where_that_is_unique(tmp_path: Path) -> 
 
 def test_one_key_twice_in_json_is_refused(tmp_path: Path) -> None:
     (tmp_path / "runs.json").write_text('{"x": {"a": 1}, "x": {"a": 2}}')
-    with pytest.raises(ReadError, match="'x' stands there twice"):
+    with pytest.raises(ReadError, match="'x' appears twice"):
         read_parameter_table(tmp_path / "runs.json")
 
 
