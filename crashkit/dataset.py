@@ -18,6 +18,7 @@ import crashkit.accessor  # noqa: F401  registers `.crash`
 from crashkit.chunks import RUNS_WITH, damaged_chunk, lost_chunks
 from crashkit.errors import CrashkitError, ReadError
 from crashkit.netcdf import open_netcdf
+from crashkit.version import __version__
 from data_schema import VARIABLES
 from data_schema import dataset_checksum as _checksum_from
 from data_schema.checksum import digests_of_run, run_checksum
@@ -56,9 +57,11 @@ def open_dataset(path: str | Path, *, chunks: Literal["stored"] | Mapping[str, i
         ) from error
     missing = [v.name for v in VARIABLES.values() if v.required and v.name not in dataset.variables]
     if missing:
+        writer = dataset.attrs.get("crashkit_version")
         dataset.close()
         raise ReadError(
             f"{path}: holds no variable {', '.join(missing)}; expected a dataset made by crashkit ingest"
+            + (f" (this one was written by crashkit {writer}, here is {__version__})" if writer else "")
             + ("; it is damaged" if "displacement" in dataset.variables else "")
         )
     with reading_dataset(path):
