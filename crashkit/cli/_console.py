@@ -9,7 +9,7 @@ import shlex
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -59,6 +59,12 @@ def what_next(look: Path | str | None, *commands: Iterable[object]) -> None:
         say(f"look at  {look}", wrap=False)
     for command in commands:
         say("next     crashkit " + shlex.join(map(str, command)), wrap=False)
+
+
+def look_in_paraview(files: Sequence[Path]) -> None:
+    """The file to open, and the script beside it that shows it in fixed colour ranges, if there is one."""
+    view = f"; {files[-1]} shows it in fixed colour ranges (File > Load State)"
+    what_next(f"{files[0]} in ParaView{view}" if files[-1].name.endswith("_view.py") else files[0])
 
 
 @contextlib.contextmanager
@@ -112,12 +118,12 @@ def fixed(value: float | None, digits: int) -> str:
     return "-" if value is None or value != value else f"{value:.{digits}f}"
 
 
-def numbers(text: str, option: str, example: str, *, whole: bool = False) -> list[Any]:
+def numbers(text: str, option: str, example: str, *, kind: str = "numbers", whole: bool = False) -> list[Any]:
     """The numbers of a list such as "8,4,4"; bad usage where it is none."""
     try:
         return [int(piece) if whole else float(piece) for piece in text.split(",")] if text else []
     except ValueError as error:
-        kind = "whole numbers" if whole else "numbers"
+        kind = "whole numbers" if whole else kind
         raise typer.BadParameter(
             f"{text!r}; expected {kind} with commas between them, such as {example}", param_hint=option
         ) from error

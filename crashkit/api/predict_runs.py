@@ -1,0 +1,224 @@
+"""Runs predicted and written to files: of one set of parameters, of every row of a table, or of a run that is known."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from data_schema.progress import Progress, silent
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from numpy.typing import ArrayLike
+
+    from crashkit.api.model import Model
+    from surrogates.record import Record
+    from surrogates.surrogate import Surrogate
+
+
+@dataclass(frozen=True)
+class PredictedRun:
+    """A run that was predicted, and where it was written.
+
+    Attributes
+    ----------
+    run
+        Its name; empty where parameters alone were given.
+    files
+        The files, the one to open first.
+    arrays
+        Names of the results in them.
+    model, level
+        What predicted it; level 0 is the full mesh.
+    states, nodes
+        How many.
+    largest_displacement_m
+        Of any predicted node, m.
+    warnings
+        What lies outside the trained range, and whether the model has seen the run.
+    mean_error_m, largest_error_m
+        m, over the nodes and states of a run that is known; None for others.
+    relative_error
+        The mean error over the mean true displacement.
+    """
+
+    run: str
+    files: list[Path]
+    arrays: list[str]
+    model: str
+    level: int
+    states: int
+    nodes: int
+    largest_displacement_m: float
+    warnings: list[str]
+    mean_error_m: float | None = None
+    largest_error_m: float | None = None
+    relative_error: float | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """As plain values, without those that are None."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
+
+
+@dataclass(frozen=True)
+class _Wanted:
+    """One run to predict: its name, parameters and file, and the truth where it is known."""
+
+    run: str
+    parameters: Mapping[str, Any]
+    output: Path
+    truth: xr.Dataset | None = None
+
+
+def predict_runs(
+    model: Model | Surrogate | str | Path,
+    output: str | Path,
+    *,
+    parameters: Mapping[str, Any] | None = None,
+    table: str | Path | None = None,
+    run: str | int | None = None,
+    dataset: str | Path | None = None,
+    time: ArrayLike | None = None,
+    level: int | None = None,
+    full: bool | None = None,
+    extrapolate: bool = False,
+    band: float | None = None,
+    sensitivity: bool = False,
+    report: Progress = silent,
+) -> list[PredictedRun]:
+    """Predict runs and write them. Give one of `parameters`, `table` and `run`.
+
+    Parameters
+    ----------
+    model
+        As `crashkit.train` or `crashkit.load_model` return it, or the path of its folder.
+    output
+        `.pvd`, `.vtkhdf`, `.vtu`, `.vtp` or `.npz`; of a table a folder, or a name with such a suffix, to which the name
+        of the run is added.
+    parameters
+        Values by name, as `crashkit.Model.predict` takes them.
+    table
+        A table of parameters: every row is predicted.
+    run, dataset
+        A run of this dataset, by name or place: it is written with the truth beside it and the error.
+    time, level, full, extrapolate, band, sensitivity
+        As for `crashkit.Model.predict`. By default a known run is predicted at its own times.
+    report
+        Called with (what, 0, 0, "") before each run.
+
+    Raises
+    ------
+    DataError, SurrogateError
+        As for `crashkit.Model.predict`; for a run that is not there, or a dataset without the model's parameters.
+    ReadError
+        For a table or a dataset that cannot be read.
+    OutputError
+        Where `output` cannot be written.
+    """
+    from crashkit.api.predict import beside_truth, model_in_hand, write_prediction
+
+    asked = model_in_hand(model)
+    rows = []
+    for wanted in _wanted(asked.record, Path(output), parameters, table, run, dataset):
+        report(f"predicting {wanted.run or asked.name}", 0, 0, "")
+        truth = wanted.truth
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # they are kept in the result
+            prediction = asked.predict(
+                wanted.parameters, truth["time"].values if time is None and truth is not None else time, level, full,
+                extrapolate=extrapolate, band=band, sensitivity=sensitivity,
+            )  # fmt: skip
+        if truth is not None:
+            prediction = beside_truth(prediction, truth)
+        about = {"model_name": f"{prediction.attrs['model']} of {asked.name}"}
+        files = write_prediction(prediction, wanted.output, about | ({"run": wanted.run} if wanted.run else {}))
+        rows.append(_predicted(wanted, prediction, files, asked.record))
+    return rows
+
+
+def _wanted(
+    record: Record,
+    output: Path,
+    parameters: Mapping[str, Any] | None,
+    table: str | Path | None,
+    run: str | int | None,
+    dataset: str | Path | None,
+) -> list[_Wanted]:
+    from crashkit.errors import DataError
+
+    if sum(given is not None for given in (parameters, table, run)) != 1 or (run is None) != (dataset is None):
+        raise DataError("expected either parameters, or a table, or a run with its dataset")
+    if table is not None:
+        return _of_table(record, output, Path(table))
+    if run is not None and dataset is not None:
+        return [_known(record, output, run, Path(dataset))]
+    return [_Wanted("", parameters or {}, output)]
+
+
+def _of_table(record: Record, output: Path, table: Path) -> list[_Wanted]:
+    from crashkit.api.predict import SUFFIXES
+    from crashkit.errors import OutputError
+    from crashkit.ingestion.parameter_table import read_parameter_table
+    from crashkit.output import file_name
+
+    if output.suffix and output.suffix not in SUFFIXES:
+        raise OutputError(f"{output}: of a table, expected a folder, or NAME.pvd, NAME.vtkhdf or NAME.npz")
+    return [
+        _Wanted(
+            row,
+            {n: f"{v!r}{unit}" for n, (v, unit) in values.items() if n in record.ranges.names},
+            output.with_name(f"{output.stem}_{file_name(row)}{output.suffix}")
+            if output.suffix
+            else output / f"{file_name(row)}.pvd",
+        )
+        for row, values in read_parameter_table(table).rows.items()
+    ]
+
+
+def _known(record: Record, output: Path, run: str | int, dataset: Path) -> _Wanted:
+    from crashkit.dataset import open_dataset, reading_dataset
+    from crashkit.errors import DataError
+    from crashkit.selection import runs_of
+
+    with open_dataset(dataset, chunks=None) as opened, reading_dataset(dataset):
+        place = runs_of([str(n) for n in opened["sim"].values], [run])[0]
+        missing = [n for n in record.ranges.names if n not in opened]
+        if missing:
+            raise DataError(f"{dataset}: has no parameter {', '.join(missing)}; give the dataset of the model")
+        truth = opened.isel(sim=place).load()
+    return _Wanted(str(truth["sim"].values), {n: float(truth[n]) for n in record.ranges.names}, output, truth)
+
+
+def _predicted(wanted: _Wanted, prediction: xr.Dataset, files: list[Path], record: Record) -> PredictedRun:
+    import numpy as np
+
+    known = wanted.truth is not None
+    sentences = [s for s in str(prediction.attrs["warnings"]).split("; ") if s]
+    for seen, what in ((record.fitted_runs, "trained"), (record.validation_runs, "tuned")):
+        if known and wanted.run in seen:
+            sentences.append(f"the model was {what} on {wanted.run}; its error there says nothing about new runs")
+    moved = prediction["predicted" if known else "displacement"].values
+    errors: dict[str, float] = {}
+    if known:
+        error = prediction["error"].values
+        motion = np.linalg.norm(prediction["displacement"].values, axis=-1)
+        errors = {
+            "mean_error_m": float(np.nanmean(error)),
+            "largest_error_m": float(np.nanmax(error)),
+            "relative_error": float(np.nanmean(error) / max(float(np.nanmean(motion)), 1e-12)),
+        }
+    return PredictedRun(
+        run=wanted.run,
+        files=files,
+        arrays=[str(n) for n, v in prediction.data_vars.items() if v.dims[:2] in (("time", "node"), ("time", "face"))],
+        model=str(prediction.attrs["model"]),
+        level=int(prediction.attrs["level"]),
+        states=prediction.sizes["time"],
+        nodes=prediction.sizes["node"],
+        largest_displacement_m=float(np.linalg.norm(moved, axis=-1).max()),
+        warnings=sentences,
+        **errors,
+    )
