@@ -113,7 +113,7 @@ def program_of(command: Sequence[str], home: Path) -> str:
     """
     first = command[0].replace("{study}", str(home.resolve()))
     if "/" in first or (home / first).is_file():
-        path = (home / first).resolve()
+        path = (home / first).absolute()  # a link stays one: the python of an environment is a link
         if not path.is_file():
             raise CampaignError(f"{path}: no such program; the campaign file starts runs with it")
         found = shutil.which(str(path))

@@ -17,7 +17,7 @@ import pytest
 from crashkit.campaign import job
 from crashkit.campaign.box import CampaignError
 from crashkit.campaign.campaign import Campaign
-from crashkit.campaign.deck import arguments
+from crashkit.campaign.deck import arguments, program_of
 from crashkit.campaign.plan import length_of
 from crashkit.campaign.table import Table
 from crashkit.errors import CrashkitError
@@ -305,3 +305,13 @@ def test_a_target_is_a_length(text: str, metres: float) -> None:
 def test_what_is_no_length_is_refused(text: str) -> None:
     with pytest.raises(CampaignError):
         length_of(text)
+
+
+def test_a_program_that_is_a_link_is_started_by_that_name(tmp_path: Path) -> None:
+    """The python of a virtual environment is a link to one that lacks the environment's packages."""
+    link = tmp_path / "env" / "python"
+    link.parent.mkdir()
+    link.symlink_to(sys.executable)
+    assert program_of([str(link), "solver.py"], tmp_path) == str(link)
+    assert program_of(["{study}/env/python"], tmp_path) == str(link)
+    assert program_of(["env/python"], tmp_path) == str(link)
