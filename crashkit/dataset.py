@@ -82,7 +82,7 @@ def reading_dataset(path: str | Path) -> Iterator[None]:
     """Values read lazily from a damaged dataset raise ReadError within this context, and not what libraries raise."""
     try:
         yield
-    except (CrashkitError, MemoryError):
+    except (CrashkitError, ImportError, MemoryError):
         raise
     except Exception as error:
         found = _damage(Path(path)) or f"cannot be read ({_one_line(error)}); it is damaged"

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from crashkit.display import watched
 from data_schema.progress import Progress
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from crashkit.mesh.levels import Hierarchy
+    from crashkit.mesh.store import MeshArrays
     from crashkit.selection import WhichRuns
 
 
@@ -93,3 +95,98 @@ def coarsen(
             warnings.warn(text, stacklevel=2)
         write_hierarchy(dataset, hierarchy, test=held, report=watched(report, progress))
     return hierarchy
+
+
+@dataclass(frozen=True)
+class CoarsenedDataset:
+    """A dataset on disk that has got its hierarchy, and what was drawn and written of it.
+
+    Attributes
+    ----------
+    path
+        The dataset.
+    settings
+        Those of the hierarchy.
+    levels
+        As `crashkit.mesh.store.summarize_hierarchy` gives them.
+    interpolation_errors_over
+        The runs over which they were measured, in words.
+    vtp
+        The levels as files.
+    picture
+        All levels side by side; None where none was asked for or this machine cannot draw.
+    parts_without_faces
+        What to know of them, a sentence each.
+    problem
+        Why no picture was drawn; empty where there is none.
+    """
+
+    path: Path
+    settings: dict[str, Any]
+    levels: list[dict[str, Any]]
+    interpolation_errors_over: str
+    vtp: list[Path]
+    picture: Path | None
+    parts_without_faces: list[str]
+    problem: str = ""
+
+
+def coarsen_with_files(
+    path: str | Path,
+    nodes: Sequence[int] | None = None,
+    ratios: Sequence[float] | None = None,
+    *,
+    picture: str | Path | None = None,
+    vtp: str | Path | None = None,
+    selection: Literal["quadric", "vtk"] = "quadric",
+    pair_distance: float | None = None,
+    test: WhichRuns | None = None,
+    report: Progress | None = None,
+) -> CoarsenedDataset:
+    """Give the dataset at `path` its mesh hierarchy, and draw and write the levels.
+
+    Parameters
+    ----------
+    picture
+        Draw all levels side by side into this file. Where this machine cannot draw, the hierarchy is made all the same.
+    vtp
+        Write each level as VTP, with its maps, into this folder.
+    nodes, ratios, selection, pair_distance, test, report
+        As for `crashkit.coarsen`, as are the errors.
+    """
+    from crashkit.extras import need
+    from crashkit.mesh.export import write_levels
+    from crashkit.mesh.store import lifting_errors_over, open_mesh, parts_without_faces, summarize_hierarchy
+
+    if picture is not None:
+        need("--picture", "report")
+    path = Path(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # parts without faces are in what is returned
+        hierarchy = coarsen(
+            path, nodes, ratios, selection=selection, pair_distance=pair_distance, test=test, report=report
+        )
+    levels, mesh = summarize_hierarchy(path), open_mesh(path)
+    files = (
+        []
+        if vtp is None
+        else write_levels(
+            vtp, hierarchy, mesh.position, mesh.face_nodes, mesh.node_id, mesh.part_id[mesh.face_part], mesh.part_id
+        )
+    )
+    problem = "" if picture is None else _draw(Path(picture), hierarchy, mesh, levels)
+    return CoarsenedDataset(
+        path, hierarchy.settings, levels, lifting_errors_over(path), files,
+        None if picture is None or problem else Path(picture), parts_without_faces(path), problem,
+    )  # fmt: skip
+
+
+def _draw(picture: Path, hierarchy: Hierarchy, mesh: MeshArrays, levels: list[dict[str, Any]]) -> str:
+    """Draw the levels; gives the reason where this machine cannot."""
+    from evaluation.drawing.levels import draw_levels
+    from evaluation.drawing.rendering import rendering_problem
+
+    problem = rendering_problem()
+    if problem is None:
+        draw_levels(picture, hierarchy, mesh.position, mesh.face_nodes, [row["lifting_error_mean"] for row in levels])
+    return problem or ""

@@ -4,12 +4,84 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
+
+from crashkit.errors import DataError
+from data_schema.progress import Progress, silent
 
 if TYPE_CHECKING:
     import xarray as xr
 
+    from surrogates.record import Record
     from surrogates.surrogate import Surrogate
+
+
+def kind_of(path: str | Path) -> Literal["model", "report", "dataset"]:
+    """What is stored at `path`, by the file that each kind of folder has; anything else is taken for a dataset."""
+    path = Path(path)
+    if (path / "model.json").exists():
+        return "model"
+    return "report" if (path / "report.json").exists() else "dataset"
+
+
+def describe(
+    path: str | Path, *, card: str | Path | None = None, overwrite: bool = False, report: Progress = silent
+) -> dict[str, Any]:
+    """The facts about a dataset, a model folder or a report as plain values, in SI units.
+
+    Parameters
+    ----------
+    card
+        Also write a data card of a dataset into this folder; its page is then in what is returned as `report`.
+    overwrite
+        Replace a data card that is there.
+    report
+        Called with (what, runs done, runs, note) while the card is made.
+
+    Raises
+    ------
+    ReadError
+        Where nothing is there, or it is damaged.
+    DataError
+        Where a card is asked of something else than a dataset.
+    OutputError
+        Where the card cannot be written.
+    """
+    path = Path(path)
+    kind = kind_of(path)
+    if card is not None and kind != "dataset":
+        raise DataError(f"{path}: is a {kind}, and a data card describes a dataset; give the path of a dataset")
+    if kind == "model":
+        from crashkit.api.predict import load_model
+
+        return describe_model(load_model(path).surrogate, path)
+    if kind == "report":
+        return describe_report(path)
+    from crashkit.dataset import open_dataset, reading_dataset
+
+    with open_dataset(path, chunks=None) as dataset:
+        with reading_dataset(path):
+            found = describe_dataset(dataset, path)
+        if card is not None:
+            found["report"] = _write_card(dataset, path, Path(card), overwrite, report)
+    return found
+
+
+def _write_card(dataset: xr.Dataset, path: Path, card: Path, overwrite: bool, report: Progress) -> Path:
+    from crashkit.api.reference import read_reference
+    from crashkit.extras import need
+    from crashkit.output import refuse_earlier
+
+    need("a data card", "report")
+    from evaluation.report.datacard import write_card
+
+    if not overwrite:
+        refuse_earlier(card, "card.json", "data card", option="--report")
+    runs = dataset.sizes["sim"]
+    return write_card(
+        read_reference(str(path), dataset), card, about={"Dataset": path.name},
+        done=lambda run: report("runs", run + 1, runs, ""),
+    )  # fmt: skip
 
 
 def describe_dataset(dataset: xr.Dataset, path: Path) -> dict[str, Any]:
@@ -157,6 +229,58 @@ def describe_model(surrogate: Surrogate, path: Path) -> dict[str, Any]:
         "choice": record.choice,
         "notes": list(record.notes),
     }
+
+
+def describe_training(surrogate: Surrogate, output: Path) -> dict[str, Any]:
+    """How the training of the model stored in `output` went."""
+    record = surrogate.record
+    return {
+        "output": output, "levels": trained_levels(surrogate), "choice": record.choice,
+        "validation_errors_m": record.errors, "training_runs": record.fitted_runs,
+        "validation_runs": record.validation_runs, "held_out_runs": record.held_out_runs,
+        "physics": record.physics, "notes": record.notes,
+    }  # fmt: skip
+
+
+def trained_levels(surrogate: Surrogate) -> list[dict[str, Any]]:
+    """Each level that was trained: its size, how long that took, and its error on validation runs, m."""
+    return [
+        {
+            "model": name,
+            "level": number,
+            "nodes": surrogate.graphs.n_nodes(number),
+            "parameters": surrogate.n_parameters(number),
+            "epochs": fit.epochs,
+            "best_epoch": fit.best_epoch,
+            "seconds": round(fit.seconds, 2),
+            "status": fit.status,
+            "validation_error_m": surrogate.record.errors.get(name),
+        }
+        for name, number in surrogate.level_names.items()
+        if (fit := surrogate.training(number)) is not None
+    ]
+
+
+def what_was_chosen(record: Record) -> list[str]:
+    """What was put in beforehand and what it was worth, and what was chosen and by what: a line each."""
+    out = [f"{name}: {told}" for name, told in record.physics.items() if isinstance(told, str)]
+    errors = record.physics.get("errors") or {}
+    if errors:
+        worth = ", ".join(f"{name} {100 * error:.2f}" for name, error in errors.items())
+        out.append(f"worth in cross-validation (cm): {worth}")
+    if record.choice:
+        by = "on validation runs" if record.validation_runs and not record.physics else "by cross-validation"
+        pieces = [f"{k} {v}" for k, v in record.choice.items()]
+        several = any("(" in piece for piece in pieces)  # one line for each level
+        out += [f"chosen {by}: {line}" for line in (pieces if several else [", ".join(pieces)])]
+    return out
+
+
+def middle(surrogate: Surrogate) -> dict[str, str]:
+    """The middle of each parameter's trained range, in the unit of its table."""
+    ranges = surrogate.record.ranges
+    values = (ranges.low + ranges.high) / 2
+    return {n: f"{v / f:.4g}" for n, v, (_, f) in zip(ranges.names, values, ranges.written, strict=True)}
 
 
 def describe_report(path: Path) -> dict[str, Any]:

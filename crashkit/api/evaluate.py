@@ -44,7 +44,7 @@ def evaluate(
     hierarchy: Hierarchy | None = None,
     write_vtu: bool = False,
     write_vtkhdf: bool = False,
-    vtk_runs: Sequence[str] | None = None,
+    vtk_runs: WhichRuns | None = None,
     probes: Sequence[int] | None = None,
     intrusion: tuple[str, str] | None = None,
     workers: int = 1,
@@ -75,7 +75,7 @@ def evaluate(
     write_vtu, write_vtkhdf
         Also write truth, prediction and error for ParaView, as PVD + VTU or as VTKHDF.
     vtk_runs
-        The runs written so; default: the worst and the median run of the best model.
+        The runs written so: names or places, or a selection such as "27:36"; default: the worst and the median run of the best model.
     probes
         The solver's numbers of nodes whose histories are compared; default: four spread over the structure.
     intrusion
@@ -127,7 +127,7 @@ def evaluate(
             f"{source.name}: holds test runs alone; give the training runs, too, by which the data is described"
         )
     entries(stored, seeds_as_spread)  # refuses what cannot be compared before anything is computed
-    reference.index(vtk_runs or ())
+    shown_runs = None if vtk_runs is None else _places(reference, vtk_runs)
     sensors = choose_sensors(reference, probes, intrusion)
     with _folder(output) as folder:
         with _counted(tell, "modes of the training runs", len(split.train)) as step:
@@ -147,7 +147,7 @@ def evaluate(
             sensors=sensors, context=_context(Path(source.name), reference, stored, split),
         )  # fmt: skip
         if formats:
-            runs = reference.index(vtk_runs) if vtk_runs else default_runs(result)
+            runs = default_runs(result) if shown_runs is None else shown_runs
             with _counted(tell, "runs for ParaView", len(runs)) as step:
                 written = []
                 for run in runs:
@@ -207,6 +207,28 @@ def _test_names(
     mine = [name for name in reference.runs if (name in held_out if held_out else name not in seen)]
     same = all(set(model.held_out_runs) == held_out for model in models)
     return mine if same else None
+
+
+def _places(reference: Reference, chosen: WhichRuns) -> list[int]:
+    """Which runs are meant. A text without a colon is names or places, never how many to draw at random."""
+    from crashkit.selection import runs_of
+
+    if isinstance(chosen, str) and ":" not in chosen:
+        chosen = chosen.split(",")
+    return runs_of(reference.runs, chosen)
+
+
+def whole_meshes(result: Evaluation, output: str | Path) -> list[Path]:
+    """The files for ParaView in the report folder `output` that show runs on the full mesh, not on the models' levels."""
+    folder = Path(output) / "vtk"
+    files = sorted((*folder.glob("*.pvd"), *folder.glob("*.vtkhdf"))) if result.files else []
+    return [file for file in files if "_level" not in file.stem]
+
+
+def best_folder(result: Evaluation, models: Sequence[Path]) -> Path:
+    """Of the model folders that were compared, the one with the smallest error."""
+    best = result.model(result.ranked[0]).name
+    return next(folder for folder in models if folder.resolve().name == best)
 
 
 @contextlib.contextmanager
@@ -273,9 +295,9 @@ def _keep_modes(pods: Mapping[int, Any], folder: Path) -> dict[int, str]:
 def _opened(source: Source, models: tuple[tuple[str, Trained | Path], ...]) -> tuple[Reference, tuple[Model, ...]]:
     """The dataset and the models as evaluation sees them."""
     from crashkit.api.predict import model_in_hand
+    from crashkit.api.reference import read_reference
     from crashkit.dataset import open_dataset
     from crashkit.errors import DataError
-    from evaluation.comparison.reference import reference_of
 
     surrogates = [(Path(name), model_in_hand(model).surrogate) for name, model in models]
     opened = open_dataset(source.name, chunks=None) if source.dataset is None else source.dataset
@@ -289,31 +311,8 @@ def _opened(source: Source, models: tuple[tuple[str, Trained | Path], ...]) -> t
                 else "give hierarchy=crashkit.coarsen(dataset)"
             )
         )
-    reference = reference_of(opened, () if source.hierarchy is None else source.hierarchy.levels)
-    reference = dataclasses.replace(reference, displacement=_reader(source.name, opened))
+    reference = read_reference(source.name, opened, () if source.hierarchy is None else source.hierarchy.levels)
     return reference, tuple(as_model(surrogate, folder, reference) for folder, surrogate in surrogates)
-
-
-def _reader(path: str, dataset: xr.Dataset) -> Callable[[int], NDArray[np.float32]]:
-    """Reads one run (state, node, 3), m; raises ReadError where it is damaged."""
-    import numpy as np
-
-    from crashkit.dataset import reading_dataset
-    from crashkit.errors import ReadError
-
-    erodes = "alive" in dataset or "cell_alive" in dataset
-
-    def read(run: int) -> NDArray[np.float32]:
-        with reading_dataset(path):
-            u = np.asarray(dataset["displacement"].isel(sim=run).values)
-        if not erodes and not np.isfinite(u).all():
-            raise ReadError(
-                f"{path}: displacements of run {dataset['sim'].values[run]} are missing though nothing erodes; expected "
-                f"numbers everywhere: see crashkit validate, and ingest the run again"
-            )
-        return u
-
-    return read
 
 
 @dataclass

@@ -221,6 +221,36 @@ def interrupted(surrogate: Surrogate) -> bool:
     return any(fit.status == "interrupted" for fit in surrogate.record.fits.values())
 
 
+# A living training writes its state every half minute.
+_DEAD_AFTER = 600.0
+
+
+def left_behind(output: str | Path, *, resume: bool = False) -> list[str]:
+    """What trainings that were killed have left beside the model folder `output`, and what can be done: a sentence each.
+
+    Parameters
+    ----------
+    resume
+        Whether the training of `output` is gone on with, which is then no news.
+    """
+    import time
+
+    output, out = Path(output), []
+    for left in sorted(output.absolute().parent.glob(".*.training")):
+        files = [f.stat() for f in left.glob("*") if f.is_file()]
+        name = left.name.removeprefix(".").removesuffix(".training")
+        if not files or (name == output.name and resume) or time.time() - max(f.st_mtime for f in files) < _DEAD_AFTER:
+            continue
+        size = sum(f.st_size for f in files) / 1e6
+        what = (
+            "is replaced now"
+            if name == output.name
+            else f"goes on with -o {output.with_name(name)} --resume; else delete it"
+        )
+        out.append(f"{left.name} ({size:.1f} MB) is left of a training that was killed: it {what}")
+    return out
+
+
 # Below this many numbers in the largest array of a step, handing work to a second thread costs more than it saves: a
 # step of small networks is hundreds of short operations, each of which waits for the slowest thread.
 _WORTH_A_THREAD = 1_000_000

@@ -113,9 +113,9 @@ def table(title: str, columns: Iterable[str], rows: Iterable[Iterable[object]]) 
     console().print(out)
 
 
-def fixed(value: float | None, digits: int) -> str:
+def fixed(value: float | None, digits: int, factor: float = 1.0) -> str:
     """A number for a table; a dash where there is none."""
-    return "-" if value is None or value != value else f"{value:.{digits}f}"
+    return "-" if value is None or value != value else f"{factor * value:.{digits}f}"
 
 
 def numbers(text: str, option: str, example: str, *, kind: str = "numbers", whole: bool = False) -> list[Any]:

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from crashkit.api.coarsen import coarsen
+from crashkit.api.coarsen import coarsen_with_files
 from crashkit.cli._console import numbers, print_json, say, table, what_next
 from crashkit.cli._progress import Progress
-from evaluation.drawing.levels import draw_levels
-
-if TYPE_CHECKING:
-    from crashkit.mesh.levels import Hierarchy
-    from crashkit.mesh.store import MeshArrays
 
 
 def command(
@@ -55,54 +51,29 @@ def command(
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Build coarser meshes (subsets of the nodes) and store them in the dataset, with the maps between them."""
-    import warnings
-
-    from crashkit.extras import need
-    from crashkit.mesh.store import lifting_errors_over, open_mesh, summarize_hierarchy
-
-    if picture is not None:
-        need("--picture", "report")
     if selection not in ("quadric", "vtk"):
         raise typer.BadParameter(f"{selection!r}; expected quadric or vtk", param_hint="--selection")
     counts = [int(n) for n in numbers(nodes, "--nodes", "1165,292,73", whole=True)]
     factors = numbers(ratios, "--ratios", "8,4,4")
     if counts and factors:
         raise typer.BadParameter("give either --nodes or --ratios", param_hint="--ratios")
-    with warnings.catch_warnings(record=True) as told, Progress(f"selecting the nodes of {path}", quiet=json) as shown:
-        warnings.simplefilter("always", UserWarning)
-        hierarchy = coarsen(
-            path,
-            counts or None,
-            factors or None,
-            selection="vtk" if selection == "vtk" else "quadric",
-            pair_distance=pair_distance,
-            test=test or None,
+    with Progress(f"selecting the nodes of {path}", quiet=json) as shown:
+        result = coarsen_with_files(
+            path, counts or None, factors or None, picture=picture, vtp=vtp,
+            selection="vtk" if selection == "vtk" else "quadric", pair_distance=pair_distance, test=test or None,
             report=shown.step,
-        )
-    without = [str(w.message) for w in told if w.category is UserWarning]
-    levels, over = summarize_hierarchy(path), lifting_errors_over(path)
-    mesh = open_mesh(path)
-    files = [] if vtp is None else _write_levels(vtp, hierarchy, mesh)
-    drawn = picture is not None and _draw(picture, hierarchy, mesh, levels)
+        )  # fmt: skip
     if json:
-        print_json(
-            {
-                "path": path,
-                "settings": hierarchy.settings,
-                "levels": levels,
-                "interpolation_errors_over": over,
-                "vtp": files,
-                "picture": picture if drawn else None,
-                "parts_without_faces": without,
-            }
-        )
+        print_json(asdict(result))
         return
-    show(path, levels, over)
-    for text in without:
+    show(path, result.levels, result.interpolation_errors_over)
+    for text in result.parts_without_faces:
         say(f"  {text}")
-    if files:
+    if result.problem:
+        say(f"{picture}: {result.problem}")
+    if result.vtp:
         say(f"levels as VTP: {vtp}")
-    what_next(picture if drawn else path, ("train", path, "-o", "model", "--test", test or "0.25"))
+    what_next(result.picture or path, ("train", path, "-o", "model", "--test", test or "0.25"))
 
 
 def show(path: Path, levels: list[dict[str, Any]], over: str) -> None:
@@ -137,29 +108,3 @@ def show(path: Path, levels: list[dict[str, Any]], over: str) -> None:
 def _descending(error: float) -> float:
     """Sorts the largest error first, and parts without faces (NaN) last."""
     return math.inf if math.isnan(error) else -error
-
-
-def _write_levels(folder: Path, hierarchy: Hierarchy, mesh: MeshArrays) -> list[Path]:
-    from crashkit.mesh.export import write_levels
-
-    return write_levels(
-        folder,
-        hierarchy,
-        mesh.position,
-        mesh.face_nodes,
-        mesh.node_id,
-        mesh.part_id[mesh.face_part],
-        mesh.part_id,
-    )
-
-
-def _draw(picture: Path, hierarchy: Hierarchy, mesh: MeshArrays, levels: list[dict[str, Any]]) -> bool:
-    """Draw the picture; where this machine cannot, say so and go on, since the hierarchy is what was asked for."""
-    from evaluation.drawing.rendering import rendering_problem
-
-    problem = rendering_problem()
-    if problem is not None:
-        say(f"{picture}: {problem}")
-        return False
-    draw_levels(picture, hierarchy, mesh.position, mesh.face_nodes, [row["lifting_error_mean"] for row in levels])
-    return True

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from crashkit.api.evaluate import evaluate
-from crashkit.cli._console import fail, print_json, say, table, what_next
+from crashkit.api.evaluate import best_folder, evaluate, whole_meshes
+from crashkit.cli._console import fail, fixed, numbers, print_json, say, table, what_next
 from crashkit.cli._progress import Progress
 
 if TYPE_CHECKING:
@@ -52,33 +51,23 @@ def command(
     """Compare models on test runs none of them has seen: report, figures, numbers, ParaView files."""
     from dataclasses import asdict
 
-    from crashkit.dataset import open_dataset
     from evaluation.report.tables import performance
 
     with Progress(f"reading {dataset}", quiet=as_json) as shown:
-        names: tuple[str, ...] = ()
-        if test or vtk_runs:
-            with open_dataset(dataset, chunks=None) as opened:
-                names = tuple(map(str, opened["sim"].values))
         result = evaluate(
-            dataset, models, output,
-            test=_named(names, test) if test else None,
-            write_vtu=write_vtu, write_vtkhdf=write_vtkhdf,
-            vtk_runs=_named(names, vtk_runs if ":" in vtk_runs else vtk_runs.split(",")) if vtk_runs else None,
-            probes=_node_numbers(probes) if probes else None,
-            intrusion=_part_and_direction(intrusion) if intrusion else None,
-            workers=workers, scheduler=scheduler or None, seeds_as_spread=seeds_as_spread, overwrite=overwrite,
-            report=shown.step,
+            dataset, models, output, test=test or None, write_vtu=write_vtu, write_vtkhdf=write_vtkhdf,
+            vtk_runs=vtk_runs or None, probes=numbers(probes, "--probes", "12,340", whole=True) or None,
+            intrusion=_part_and_direction(intrusion) if intrusion else None, workers=workers,
+            scheduler=scheduler or None, seeds_as_spread=seeds_as_spread, overwrite=overwrite, report=shown.step,
         )  # fmt: skip
     if as_json:
         rows = performance(result)
         print_json({"output": output, "report": output / "report.html", "performance": [asdict(r) for r in rows]})
         return
     show(result)
-    for path in sorted((*(output / "vtk").glob("*.pvd"), *(output / "vtk").glob("*.vtkhdf"))):
-        if "_level" not in path.stem:
-            say(f"ParaView {path}")
-    best = Path(next(m for m in models if m.resolve().name == result.model(result.ranked[0]).name))
+    for file in whole_meshes(result, output):
+        say(f"ParaView {file}")
+    best = best_folder(result, models)
     what_next(output / "report.html", ("predict", best, "--run", result.test_names[0], "--dataset", dataset))
 
 
@@ -98,9 +87,9 @@ def show(result: Evaluation) -> None:
         ("model", "nodes", "error", *(["± seeds"] if several else []), "% of motion", "worst run", "train s", "ms"),
         (
             (
-                r.model, r.nodes, f"{r.error_cm:.3f}", *([_or_dash(r.spread_cm, ".3f")] if several else []),
-                f"{100 * r.relative:.1f}", f"{r.worst_run_cm:.2f}", _or_dash(r.training_s, ".0f"),
-                _or_dash(r.prediction_lifted_ms, ".2g"),
+                r.model, r.nodes, f"{r.error_cm:.3f}", *([fixed(r.spread_cm, 3)] if several else []),
+                f"{100 * r.relative:.1f}", f"{r.worst_run_cm:.2f}", fixed(r.training_s, 0),
+                "-" if r.prediction_lifted_ms != r.prediction_lifted_ms else f"{r.prediction_lifted_ms:.2g}",
             )
             for r in rows
         ),
@@ -110,26 +99,8 @@ def show(result: Evaluation) -> None:
             say(f"  {statement.about}: {statement.text}")
 
 
-def _named(names: Sequence[str], chosen: str | list[str]) -> list[str]:
-    """Names of the runs that an option means."""
-    from crashkit.selection import runs_of
-
-    return [names[k] for k in runs_of(names, chosen)]
-
-
-def _node_numbers(text: str) -> list[int]:
-    try:
-        return [int(piece) for piece in text.split(",")]
-    except ValueError:
-        fail(f"--probes {text!r} not understood; expected node numbers with commas, such as 12,340", code=2)
-
-
 def _part_and_direction(text: str) -> tuple[str, str]:
     part, colon, direction = text.rpartition(":")
     if not colon or not part:
         fail(f"--intrusion {text!r} not understood; expected a part and a direction, such as floor:-x", code=2)
     return part, direction
-
-
-def _or_dash(value: float, form: str) -> str:
-    return format(value, form) if value == value else "-"

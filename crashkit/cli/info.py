@@ -34,46 +34,14 @@ def command(
 
     Of a dataset: runs, states, mesh, parts, parameters with their units, largest displacement, mesh hierarchy.
     """
-    if (path / "model.json").exists():
-        from crashkit.api.describe import describe_model
-        from crashkit.api.predict import load_model
+    from crashkit.api.describe import describe, kind_of
 
-        with Progress(f"reading {path}", quiet=as_json):
-            found = describe_model(load_model(path).surrogate, path)
-        print_json(found) if as_json else _print_model(found)
-    elif (path / "report.json").exists():
-        from crashkit.api.describe import describe_report
-
-        found = describe_report(path)
-        print_json(found) if as_json else _print_report(found)
+    with Progress(f"reading {path}", quiet=as_json) as shown:
+        found = describe(path, card=report, overwrite=overwrite, report=shown.step)
+    if as_json:
+        print_json(found)
     else:
-        found = _dataset(path, report, overwrite, as_json)
-        print_json(found) if as_json else _print_dataset(found)
-        if report is not None and not as_json:
-            what_next(found["report"])
-
-
-def _dataset(path: Path, report: Path | None, overwrite: bool, quiet: bool) -> dict[str, Any]:
-    from crashkit.api.describe import describe_dataset
-    from crashkit.dataset import open_dataset, reading_dataset
-
-    with (
-        Progress(f"reading {path}", quiet=quiet) as shown,
-        open_dataset(path, chunks=None) as dataset,
-        reading_dataset(path),
-    ):
-        found = describe_dataset(dataset, path)
-        if report is not None:
-            from crashkit.output import refuse_earlier
-            from evaluation.report.datacard import write_card
-
-            if not overwrite:
-                refuse_earlier(report, "card.json", "data card", option="--report")
-            runs = dataset.sizes["sim"]
-            found["report"] = write_card(
-                dataset, report, about={"Dataset": path.name}, done=lambda run: shown.step("runs", run + 1, runs)
-            )
-    return found
+        {"dataset": _print_dataset, "model": _print_model, "report": _print_report}[kind_of(path)](found)
 
 
 def _print_dataset(found: dict[str, Any]) -> None:
@@ -107,11 +75,17 @@ def _print_dataset(found: dict[str, Any]) -> None:
         _print_parameters(found["parameters"])
     else:
         line("parameters", "none")
-    if not found["levels"]:
+    if found["levels"]:
+        _print_levels(found["levels"], found["interpolation_errors_over"])
+    else:
         line("hierarchy", f"none yet; make one with crashkit coarsen {found['path']}")
-        return
+    if "report" in found:
+        what_next(found["report"])
+
+
+def _print_levels(levels: list[dict[str, Any]], over: str) -> None:
     table(
-        f"mesh hierarchy, interpolation errors over {found['interpolation_errors_over']}",
+        f"mesh hierarchy, interpolation errors over {over}",
         ("level", "nodes", "faces", "distance mean / max (mm)", "interpolation error mean / max (cm)"),
         [
             (
@@ -119,7 +93,7 @@ def _print_dataset(found: dict[str, Any]) -> None:
                 f"{level['distance_mean'] * 1e3:.2f} / {level['distance_max'] * 1e3:.1f}",
                 f"{level['lifting_error_mean'] * 100:.3f} / {level['lifting_error_max'] * 100:.2f}",
             )
-            for level in found["levels"]
+            for level in levels
         ],
     )  # fmt: skip
 

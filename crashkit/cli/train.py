@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from crashkit.api.train import interrupted, train
-from crashkit.cli._console import print_json, say, table, what_next
+from crashkit.api.describe import describe_training, middle, trained_levels, what_was_chosen
+from crashkit.api.train import interrupted, left_behind, train
+from crashkit.cli._console import fixed, print_json, say, table, what_next
 from crashkit.cli._progress import Progress
 
 if TYPE_CHECKING:
@@ -56,7 +56,8 @@ def command(
     if odd:
         given.append(f"physics.odd=[{odd}]")
     if not json:
-        _name_dead(output, resume)
+        for left in left_behind(output, resume=resume):
+            say(f"note: {left}")
     with Progress(f"reading {dataset}", quiet=json) as shown:
         surrogate = train(
             dataset, output, model or None, preset=preset or None, settings=given, config=config, seed=seed,
@@ -64,7 +65,7 @@ def command(
             tensorboard=tensorboard, on_epoch=epoch_lines(shown, verbose),
         ).surrogate  # fmt: skip
     if json:
-        print_json(_as_json(surrogate, output))
+        print_json(describe_training(surrogate, output))
         return
     show(surrogate, output)
     if interrupted(surrogate):
@@ -72,32 +73,8 @@ def command(
     elif surrogate.record.held_out_runs:
         what_next(output / "card.md", ("evaluate", dataset, output, "-o", "report"))
     else:
-        ranges = surrogate.record.ranges
-        middle = (ranges.low + ranges.high) / 2
-        first = {n: f"{m / f:.4g}" for n, m, (_, f) in zip(ranges.names, middle, ranges.written, strict=True)}
-        what_next(
-            output / "card.md", ("predict", output, *(x for n, a in first.items() for x in ("--param", f"{n}={a}")))
-        )
-
-
-# A living training writes its state every half minute.
-_DEAD_AFTER = 600.0
-
-
-def _name_dead(output: Path, resume: bool) -> None:
-    """Say what trainings that were killed have left beside `output`, and what can be done with it."""
-    for left in sorted(output.absolute().parent.glob(".*.training")):
-        files = [f.stat() for f in left.glob("*") if f.is_file()]
-        name = left.name.removeprefix(".").removesuffix(".training")
-        if not files or (name == output.name and resume) or time.time() - max(f.st_mtime for f in files) < _DEAD_AFTER:
-            continue
-        size = sum(f.st_size for f in files) / 1e6
-        what = (
-            "is replaced now"
-            if name == output.name
-            else f"goes on with -o {output.with_name(name)} --resume; else delete it"
-        )
-        say(f"note: {left.name} ({size:.1f} MB) is left of a training that was killed: it {what}")
+        asked = (x for name, value in middle(surrogate).items() for x in ("--param", f"{name}={value}"))
+        what_next(output / "card.md", ("predict", output, *asked))
 
 
 def epoch_lines(shown: Progress, verbose: bool = False) -> Callable[[Epoch], None]:
@@ -116,33 +93,6 @@ def epoch_lines(shown: Progress, verbose: bool = False) -> Callable[[Epoch], Non
     return report
 
 
-def _levels(surrogate: Surrogate) -> list[dict[str, object]]:
-    return [
-        {
-            "model": name,
-            "level": number,
-            "nodes": surrogate.graphs.n_nodes(number),
-            "parameters": surrogate.n_parameters(number),
-            "epochs": fit.epochs,
-            "best_epoch": fit.best_epoch,
-            "seconds": round(fit.seconds, 2),
-            "status": fit.status,
-            "validation_error_m": surrogate.record.errors.get(name),
-        }
-        for name, number in surrogate.level_names.items()
-        if (fit := surrogate.training(number)) is not None
-    ]
-
-
-def _as_json(surrogate: Surrogate, output: Path) -> dict[str, object]:
-    record = surrogate.record
-    return {
-        "output": output, "levels": _levels(surrogate), "choice": record.choice, "validation_errors_m": record.errors,
-        "training_runs": record.fitted_runs, "validation_runs": record.validation_runs,
-        "held_out_runs": record.held_out_runs, "physics": record.physics, "notes": record.notes,
-    }  # fmt: skip
-
-
 def show(surrogate: Surrogate, output: Path) -> None:
     """What was trained and how well it does on validation runs."""
     record = surrogate.record
@@ -155,27 +105,10 @@ def show(surrogate: Surrogate, output: Path) -> None:
         (
             (
                 r["model"], r["nodes"], r["parameters"], r["epochs"] or "-", r["best_epoch"] or "-",
-                f"{r['seconds']:.1f}",
-                "-" if r["validation_error_m"] is None else f"{100 * float(str(r['validation_error_m'])):.2f}",
+                f"{r['seconds']:.1f}", fixed(r["validation_error_m"], 2, 100),
             )
-            for r in _levels(surrogate)
+            for r in trained_levels(surrogate)
         ),
     )  # fmt: skip
-    for line in _physics(record.physics):
+    for line in what_was_chosen(record):
         say(line)
-    if record.choice:
-        by = "on validation runs" if record.validation_runs and not record.physics else "by cross-validation"
-        pieces = [f"{k} {v}" for k, v in record.choice.items()]
-        several = any("(" in piece for piece in pieces)  # one line for each level
-        for line in pieces if several else [", ".join(pieces)]:
-            say(f"chosen {by}: {line}")
-
-
-def _physics(physics: Mapping[str, Any]) -> list[str]:
-    """What was put in beforehand, and what it was worth."""
-    out = [f"{name}: {told}" for name, told in physics.items() if isinstance(told, str)]
-    errors = physics.get("errors") or {}
-    if errors:
-        worth = ", ".join(f"{name} {100 * error:.2f}" for name, error in errors.items())
-        out.append(f"worth in cross-validation (cm): {worth}")
-    return out

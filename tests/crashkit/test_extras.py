@@ -100,3 +100,15 @@ def test_ingest_meshes_and_paraview_files_need_no_extra(tmp_path: Path) -> None:
 def test_help_needs_no_extra(command: str) -> None:
     result = without_extras(command, "--help")
     assert result.returncode == 0, result.stderr
+
+
+def test_a_data_card_that_needs_an_extra_does_not_blame_the_dataset(
+    demo_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hide(monkeypatch, "jinja2")
+    result = CliRunner().invoke(app, ["info", str(demo_dataset), "--report", str(tmp_path / "card")])
+    assert result.exit_code == 1
+    assert result.stderr.strip().endswith(
+        "a data card needs jinja2, which is not installed: pip install 'crashkit[report]'"
+    )
+    assert not (tmp_path / "card").exists()
