@@ -87,7 +87,7 @@ class _Search:
         clock = settings.physics.clock == "auto"
         self.speeds = [k for k in positive if clock and self.dimensions[k] == SPEED]
         self.others = tuple(k for k in positive if self.dimensions[k] in (STRESS, MASS))
-        self.plain = DerivedInputs.identity(self.names)
+        self.plain = self._as_named(settings.inputs.derived)
         self.tried: set[_Way] = set()
         self.lowest = np.inf
 
@@ -153,7 +153,7 @@ class _Search:
         return [(plane, odd) for plane in range(len(self.campaign.mirrors)) for odd in sets if odd]
 
     def sets(self, odd: tuple[str, ...]) -> list[DerivedInputs]:
-        """Inputs to choose from, without monomials."""
+        """Inputs to choose from, with no monomials but those that the settings name, which all of them have."""
         wish = self.settings.inputs.derived
         if wish == "off":
             return [self.plain]
@@ -163,8 +163,19 @@ class _Search:
         out = [*logs, *(with_matrix(inputs, odd) for inputs in logs), self.plain]
         return list(dict.fromkeys(out))
 
+    def _as_named(self, wish: str | Sequence[str]) -> DerivedInputs:
+        """The parameters as they are, but for the monomials that the settings name: what is left where nothing pays."""
+        plain = DerivedInputs.identity(self.names)
+        if isinstance(wish, str):
+            return plain
+        used = np.any([parse_monomial(text, self.names) for text in wish], axis=0)
+        logs = logarithms(self.names, self.parameters, warp=False).columns
+        columns = (log if k else column for k, log, column in zip(used, logs, plain.columns, strict=True))
+        return self._with_named(replace(plain, columns=tuple(columns)), wish)
+
     def _with_named(self, inputs: DerivedInputs, wanted: Sequence[str]) -> DerivedInputs:
         """Each named monomial in the place of its last parameter for which that is possible."""
+        given: list[tuple[float, ...]] = []
         for text in wanted:
             powers = parse_monomial(text, self.names)
             used = [k for k, power in enumerate(powers) if power]
@@ -173,9 +184,13 @@ class _Search:
                 raise SurrogateError(
                     f"inputs.derived: {text!r} takes the logarithm of {bad[0]}, which is not positive or hardly changes"
                 )
-            places = places_for(inputs, powers)
-            if places:
-                inputs = with_monomial(inputs, powers, places[-1])
+            places = [k for k in places_for(inputs, powers) if inputs.columns[k].powers not in given]
+            if not places:
+                raise SurrogateError(
+                    f"inputs.derived: {text!r} follows from the monomials named before it; leave it out"
+                )
+            inputs = with_monomial(inputs, powers, places[-1])
+            given.append(inputs.columns[places[-1]].powers)
         return inputs
 
     def monomials(self, way: _Way) -> Iterator[DerivedInputs]:
@@ -224,7 +239,8 @@ def choose(
 ) -> tuple[Registration, int, Worth]:
     """The registration of the training runs `chosen`, the place of its plane, and what it is worth.
 
-    The identity where runs are few, nothing is known of the parameters, or nothing was gained.
+    The identity where runs are few, nothing is known of the parameters, or nothing was gained; monomials that the
+    settings name are inputs in every case.
     """
     search = _Search(campaign, chosen, settings, trials)
     _check_odd(settings, search.names)
@@ -251,7 +267,8 @@ def choose(
 
 def _worth(search: _Search, identity: _Way, way: _Way) -> dict[str, float]:
     """e2, m: as they are, all, and each idea alone and left out."""
-    out = {"parameters as they are": search.error(identity)}
+    as_named = not isinstance(search.settings.inputs.derived, str)
+    out = {"inputs as named" if as_named else "parameters as they are": search.error(identity)}
     if way == identity:
         return out
     ideas: dict[str, dict[str, Any]] = {
@@ -273,12 +290,7 @@ def _worth(search: _Search, identity: _Way, way: _Way) -> dict[str, float]:
 
 def not_used(registration: Registration, settings: Settings) -> list[str]:
     """A sentence for each wish of the settings that cross-validation, or the mesh, did not confirm."""
-    wish, out = settings.inputs.derived, []
-    if not isinstance(wish, str):
-        names = registration.inputs.names
-        taken = {column.powers for column in registration.inputs.columns if column.logarithm}
-        left = [text for text in wish if parse_monomial(text, names) not in taken]
-        out += [f"inputs.derived={text} did not lower the error in cross-validation and is not used" for text in left]
+    out = []
     if settings.physics.odd and registration.symmetry.is_identity:
         out.append(
             f"physics.odd={', '.join(settings.physics.odd)} is not used: the mesh has no mirror plane, or mirrored runs "

@@ -12,7 +12,7 @@ from scipy.sparse import identity
 from surrogates.data.campaign import Campaign, Mirror
 from surrogates.data.samples import Notes
 from surrogates.errors import SurrogateError
-from surrogates.physics.choice import _Search, choose, not_used, of_campaign
+from surrogates.physics.choice import _Search, choose, of_campaign
 from surrogates.physics.derived import SPEED, STRESS
 from surrogates.physics.trials import Folds, Trials, courses_of
 from surrogates.settings import Settings, settings
@@ -84,17 +84,20 @@ def test_what_is_switched_off_stays_off(idea: str) -> None:
 
 def test_named_monomials_are_the_ones_taken() -> None:
     chosen = settings("pod-gpr", overrides=["inputs.derived=speed**2/strength"])
-    registration, _, _ = found(crash(16), chosen)
+    registration, _, worth = found(crash(16), chosen)
     assert "ln(speed^2 / strength)" in registration.inputs.told()
-    assert not not_used(registration, chosen)
+    assert "inputs as named" in worth.errors
 
 
-def test_a_named_monomial_that_does_not_pay_is_said_to_be_left_out() -> None:
-    chosen = settings("pod-gpr", overrides=["inputs.derived=speed**2/strength", "physics.clock=off"])
-    notes = Notes()
-    registration, _ = of_campaign(crash(16), chosen, notes)
-    assert registration.inputs.is_identity
-    assert "inputs.derived=speed**2/strength did not lower the error in cross-validation and is not used" in notes.lines
+@pytest.mark.parametrize("runs", [4, 16])
+def test_named_monomials_are_taken_where_nothing_pays(runs: int) -> None:
+    draw = np.random.default_rng(3)
+    noise = draw.standard_normal((runs, 7, 81, 3)).astype(np.float32)
+    campaign = plate.campaign(runs, displacement=lambda level: noise, dimensions=(SPEED, None, STRESS))
+    speed, _, strength = campaign.parameter_names
+    chosen = settings("pod-gpr", overrides=[f"inputs.derived={speed}/{strength}"])
+    registration, _, _ = found(campaign, chosen)
+    assert f"ln({speed} / {strength})" in registration.inputs.told()
 
 
 def test_noise_is_left_as_it_is() -> None:
@@ -140,6 +143,7 @@ def test_a_parameter_declared_odd_on_a_mesh_without_a_mirror_plane_is_named() ->
         ("physics.odd=[weight]", "physics.odd names 'weight', which is no parameter; there are speed"),
         ("inputs.derived=speed**2/offset", "takes the logarithm of offset"),
         ("inputs.derived=speed**2/weight", "no parameter"),
+        ("inputs.derived=[speed**2/strength, strength/speed**2]", "follows from the monomials named before it"),
     ],
 )
 def test_names_that_are_not_there_are_refused(override: str, told: str) -> None:
