@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
     from crashkit.api.source import Source
     from crashkit.selection import WhichRuns
-    from surrogates.data.campaign import Campaign, Labels, Mirror
+    from data_schema.mirror import MirrorPlane
+    from surrogates.data.campaign import Campaign, Labels
 
 
 class RunField:
@@ -139,11 +140,10 @@ def labels_of(dataset: xr.Dataset) -> Labels:
     return Labels(**ids, part_name=tuple(map(str, dataset["part_name"].values)), face_id=face_id)
 
 
-def _mirrors(dataset: Any) -> tuple[Mirror, ...]:
+def _mirrors(dataset: Any) -> tuple[MirrorPlane, ...]:
     """The mirror planes of the dataset's mesh, without those of a mesh that differs from run to run."""
     from crashkit.errors import MeshError
     from crashkit.mesh.symmetry import mirror_planes
-    from surrogates.data.campaign import Mirror
 
     at = dataset["reference_position"]
     if "sim" in at.dims and float((at.max("sim") - at.min("sim")).max()) > 1e-9:
@@ -152,7 +152,6 @@ def _mirrors(dataset: Any) -> tuple[Mirror, ...]:
     _log.info("mirror planes of the mesh")
     part = dataset["face_part"].values if "face_part" in dataset else None
     try:
-        planes = mirror_planes(at.values, dataset["face_nodes"].values, part)
+        return tuple(mirror_planes(at.values, dataset["face_nodes"].values, part))
     except MeshError:
         return ()
-    return tuple(Mirror(plane.reflection, plane.to_image, plane.name, plane.told()) for plane in planes)

@@ -7,7 +7,7 @@ the barycentric weights of the closest point of the mesh there, as in `crashkit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from crashkit.mesh import _closest
 from crashkit.mesh.probe import cells_of_nodes, closest_cells, coarse_cells
 from crashkit.mesh.surface import Surface, surface
+from data_schema.mirror import MirrorPlane
 
 # A plane counts as one where mirrored nodes lie this close to the surface, in mean edge lengths: on average, and but
 # for one node in a hundred.
@@ -27,51 +28,6 @@ _SEEN = 2000
 _ROUNDS = 12
 # Cosine above which two normals are the same direction.
 _ALIKE = 0.999
-
-
-@dataclass(frozen=True)
-class MirrorPlane:
-    """A plane in which the mesh is (nearly) its own image, and the map of fields.
-
-    Attributes
-    ----------
-    normal
-        (3,), of length 1, its largest component positive; offset, m: the plane is normal . x = offset.
-    to_image
-        (n, n): row i holds the weights with which the field at the mirror image of node i is put together.
-    mean, most, largest
-        Distance, m, of mirrored nodes from the surface: mean, 99 of 100, largest.
-    edge
-        Mean edge length, m.
-    """
-
-    normal: NDArray[np.float64]
-    offset: float
-    to_image: sparse.csr_matrix
-    mean: float
-    most: float
-    largest: float
-    edge: float
-
-    @property
-    def reflection(self) -> NDArray[np.float64]:
-        """(3, 3): what a vector becomes in the mirror."""
-        return reflection(self.normal)
-
-    @property
-    def name(self) -> str:
-        """Such as "y = 0.012 m", or the normal where the plane is oblique."""
-        axis = int(np.abs(self.normal).argmax())
-        if self.normal[axis] > 1 - 1e-9:
-            return f"{'xyz'[axis]} = {round(self.offset, 4) + 0.0:g} m"
-        return f"({', '.join(f'{c:.3f}' for c in self.normal)}) . x = {self.offset:.4g} m"
-
-    def told(self) -> str:
-        """One sentence on how well the mesh fits its image."""
-        return (
-            f"mirror plane {self.name}: mirrored nodes lie {1e3 * self.mean:.2g} mm from the surface on average, "
-            f"{1e3 * self.largest:.2g} mm at most (edges are {1e3 * self.edge:.2g} mm)"
-        )
 
 
 def mirror_planes(position: ArrayLike, face_nodes: ArrayLike, face_part: ArrayLike | None = None) -> list[MirrorPlane]:
@@ -130,11 +86,6 @@ def _surface(
     """The surface, and by what (3,) it was moved towards the origin, as `surface` does with a mesh far away from it."""
     mesh = surface(position, face_nodes, face_part)
     return mesh, np.asarray(position, np.float64)[0] - mesh.position[0]
-
-
-def reflection(normal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 3): the Householder matrix I - 2 n n^T."""
-    return np.eye(3) - 2 * np.outer(normal, normal)
 
 
 def _candidates(mesh: Surface) -> list[tuple[NDArray[np.float64], float]]:

@@ -8,9 +8,9 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from data_schema.levels import Level
+from data_schema.mirror import MirrorPlane
 
 
 class RunByRun(Protocol):
@@ -34,26 +34,6 @@ class Labels:
     part_id: NDArray[np.int64]
     part_name: tuple[str, ...]
     face_id: NDArray[np.int64] | None = None
-
-
-@dataclass(frozen=True)
-class Mirror:
-    """A plane in which the structure is its own image, as arrays.
-
-    Attributes
-    ----------
-    reflection
-        (3, 3): what a vector becomes in the mirror.
-    to_image
-        (node, node) of the full mesh: row i holds the weights of the field at the mirror image of node i.
-    told
-        What it is and how well the mesh fits its image, in a sentence; `name` in a word.
-    """
-
-    reflection: NDArray[np.float64]
-    to_image: sparse.csr_matrix
-    name: str = "mirror plane"
-    told: str = ""
 
 
 @dataclass(frozen=True)
@@ -114,6 +94,6 @@ class Campaign:
     labels: Labels | None = None
     table_units: tuple[tuple[str, float], ...] = ()
     dimensions: tuple[tuple[float, float, float] | None, ...] = ()
-    mirrors: tuple[Mirror, ...] = ()
+    mirrors: tuple[MirrorPlane, ...] = ()
     known: NDArray[np.bool_] | None = None
     erodes: bool = False

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from surrogates.data.campaign import Mirror
+from data_schema.mirror import MirrorPlane
 
 # Parameters that may be odd and are tried in all combinations.
 # States that are mirrored at once.
@@ -38,7 +38,7 @@ class Symmetry:
         Whether the side is one more input.
     """
 
-    mirror: Mirror | None = None
+    mirror: MirrorPlane | None = None
     odd: tuple[str, ...] = ()
     flagged: bool = False
 
@@ -69,9 +69,8 @@ class Symmetry:
         """Plain values; the map of fields is left out, since only training needs it."""
         plane = None
         if self.mirror is not None:
-            plane = {
-                "reflection": self.mirror.reflection.tolist(), "name": self.mirror.name, "told": self.mirror.told,
-            }  # fmt: skip
+            fit = {name: getattr(self.mirror, name) for name in ("offset", "mean", "most", "largest", "edge")}
+            plane = {"normal": self.mirror.normal.tolist(), **fit}
         return {"mirror": plane, "odd": list(self.odd), "flagged": self.flagged}
 
     @classmethod
@@ -80,13 +79,14 @@ class Symmetry:
         plane = values["mirror"]
         mirror = None
         if plane is not None:
-            none = sparse.csr_matrix((0, 0))
-            mirror = Mirror(np.array(plane["reflection"], np.float64), none, str(plane["name"]), str(plane["told"]))
+            fit = {name: float(plane[name]) for name in ("mean", "most", "largest", "edge")}
+            normal, none = np.array(plane["normal"], np.float64), sparse.csr_matrix((0, 0))
+            mirror = MirrorPlane(normal, float(plane["offset"]), none, **fit)
         return cls(mirror, tuple(values["odd"]), bool(values["flagged"]))
 
 
 def mirrored(
-    mirror: Mirror, states: NDArray[np.float32], nodes: NDArray[np.int64] | None = None
+    mirror: MirrorPlane, states: NDArray[np.float32], nodes: NDArray[np.int64] | None = None
 ) -> NDArray[np.float32]:
     """(state, node, 3): the image of states (state, node of the full mesh, 3) in `mirror`, on `nodes` (default: all)."""
     rows = (mirror.to_image if nodes is None else mirror.to_image[nodes]).astype(states.dtype)

@@ -15,8 +15,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from data_schema.mirror import MirrorPlane
 from data_schema.pod import pod
-from surrogates.data.campaign import Campaign, Mirror
+from surrogates.data.campaign import Campaign
 from surrogates.data.inputs import over_range
 from surrogates.data.samples import LevelRuns, Notes
 from surrogates.errors import SurrogateError
@@ -122,7 +123,7 @@ class Courses:
         campaign: Campaign,
         runs: LevelRuns,
         chosen: NDArray[np.int64],
-        mirrors: Sequence[Mirror],
+        mirrors: Sequence[MirrorPlane],
         modes: int,
         seed: int,
     ) -> Courses:
@@ -317,7 +318,9 @@ def courses_of(campaign: Campaign, settings: Settings, chosen: NDArray[np.int64]
     return Courses.of(campaign, runs, chosen, campaign.mirrors, modes, settings.seed)
 
 
-def _basis(runs: LevelRuns, chosen: NDArray[np.int64], mirrors: Sequence[Mirror], count: int) -> NDArray[np.float32]:
+def _basis(
+    runs: LevelRuns, chosen: NDArray[np.int64], mirrors: Sequence[MirrorPlane], count: int
+) -> NDArray[np.float32]:
     """(3 * node, mode): the structure as a whole moved along each axis, then the POD of runs and images, of what is
     left without their translation; orthonormal."""
 

@@ -17,7 +17,8 @@ import pytest
 from pydantic import BaseModel
 from scipy import sparse
 
-from surrogates.data.campaign import Campaign, Mirror
+from data_schema.mirror import MirrorPlane
+from surrogates.data.campaign import Campaign
 from surrogates.errors import SurrogateError
 from surrogates.physics import trials
 from surrogates.settings import Settings, settings
@@ -118,7 +119,9 @@ MU = plate.parameters(2, seed=5)
 
 @functools.cache
 def campaign() -> Campaign:
-    mirror = Mirror(np.diag([-1.0, 1.0, 1.0]), sparse.csr_matrix(np.eye(81)[np.arange(81).reshape(9, 9)[::-1].ravel()]))
+    mirror = MirrorPlane(
+        np.array([1.0, 0.0, 0.0]), 0.5, sparse.csr_matrix(np.eye(81)[np.arange(81).reshape(9, 9)[::-1].ravel()])
+    )
     speed, stress = (0.0, 1.0, -1.0), (1.0, -1.0, -2.0)
     return plate.campaign(10, dimensions=(speed, None, stress), mirrors=(mirror,))
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from crashkit.mesh.symmetry import MirrorPlane, mirror_plane, mirror_planes
+from crashkit.mesh.symmetry import mirror_plane, mirror_planes
+from data_schema.mirror import MirrorPlane
 
 
 def box(n: int = 6, *, shift: float = 0.0, jitter: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -40,7 +41,7 @@ def test_the_plane_is_found_wherever_it_lies(shift: float) -> None:
     assert plane.offset == pytest.approx(shift, abs=1e-6)
     assert plane.largest < 1e-6
     assert mirrored_position_error(plane, points) < 1e-6
-    assert "on average" in plane.told()
+    assert "on average" in plane.told
 
 
 def test_a_plane_askew_is_found_too() -> None:

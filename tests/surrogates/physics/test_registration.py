@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import sparse
 
-from surrogates.data.campaign import Campaign, Mirror
+from data_schema.mirror import MirrorPlane
+from surrogates.data.campaign import Campaign
 from surrogates.data.samples import Notes, ValidationSplit
 from surrogates.physics.clock import Clock
 from surrogates.physics.derived import SPEED, STRESS, DerivedInputs, logarithms
@@ -21,11 +22,8 @@ from surrogates.training.train import train_surrogate
 
 DIMENSIONS = (SPEED, None, STRESS)
 # x -> 1 - x on the plate's grid, node by node.
-MIRROR = Mirror(
-    np.diag([-1.0, 1.0, 1.0]),
-    sparse.csr_matrix(np.eye(81)[np.arange(81).reshape(9, 9)[::-1].ravel()]),
-    "x = 0.5 m",
-    "mirror plane x = 0.5 m: mirrored nodes lie on nodes",
+MIRROR = MirrorPlane(
+    np.array([1.0, 0.0, 0.0]), 0.5, sparse.csr_matrix(np.eye(81)[np.arange(81).reshape(9, 9)[::-1].ravel()])
 )
 
 
