@@ -9,7 +9,8 @@ import plate
 import pytest
 from scipy.sparse import identity
 
-from surrogates.data.campaign import Campaign, Mirror
+from data_schema.mirror import MirrorPlane
+from surrogates.data.campaign import Campaign
 from surrogates.data.samples import Notes
 from surrogates.errors import SurrogateError
 from surrogates.physics.choice import _Search, choose, of_campaign
@@ -115,7 +116,10 @@ def one_sided(runs: int) -> Campaign:
     mu = whole.parameters * [1, 0, 1] + [0, 1, 0] * np.abs(whole.parameters) + [0, 0.2, 0]
     u = whole.displacement(0)
     return replace(
-        whole, parameters=mu, displacement=lambda level: u, mirrors=(Mirror(np.diag([1.0, 1, -1]), identity(30)),)
+        whole,
+        parameters=mu,
+        displacement=lambda level: u,
+        mirrors=(MirrorPlane(np.array([0.0, 0.0, 1.0]), 0.0, identity(30)),),
     )
 
 

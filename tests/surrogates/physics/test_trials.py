@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy import sparse
 
-from surrogates.data.campaign import Campaign, Mirror
+from data_schema.mirror import MirrorPlane
+from surrogates.data.campaign import Campaign
 from surrogates.data.samples import Notes
 from surrogates.models.pod_regression import Inputs, _Candidate, _errors, _held
 from surrogates.physics.clock import Clock
@@ -23,7 +24,9 @@ from surrogates.settings import settings
 RUNS = 14
 FOLDS = Folds(np.arange(RUNS)[None] % 4)
 # x -> 1 - x on the plate's grid, node by node.
-MIRROR = Mirror(np.diag([-1.0, 1.0, 1.0]), sparse.csr_matrix(np.eye(81)[np.arange(81).reshape(9, 9)[::-1].ravel()]))
+MIRROR = MirrorPlane(
+    np.array([1.0, 0.0, 0.0]), 0.5, sparse.csr_matrix(np.eye(81)[np.arange(81).reshape(9, 9)[::-1].ravel()])
+)
 CHOSEN = {model: settings(model, overrides=["pod.points=30"]) for model in ("pod-gpr", "pod-rbf")}
 
 

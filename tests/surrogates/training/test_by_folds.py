@@ -12,7 +12,8 @@ import torch
 from numpy.typing import NDArray
 from scipy import sparse
 
-from surrogates.data.campaign import Campaign, Mirror
+from data_schema.mirror import MirrorPlane
+from surrogates.data.campaign import Campaign
 from surrogates.models.cascade import Cascade
 from surrogates.physics.choice import Worth
 from surrogates.physics.clock import Clock
@@ -28,8 +29,11 @@ from surrogates.training.loop import Objective
 
 RUNS = 7
 # x -> 1 - x on the plate's grid, node by node.
-MIRROR = Mirror(
-    np.diag([-1.0, 1.0, 1.0]), sparse.csr_matrix(np.eye(81)[np.arange(81).reshape(9, 9)[::-1].ravel()]), "x = 0.5 m"
+MIRROR = MirrorPlane(
+    np.array([1.0, 0.0, 0.0]),
+    0.5,
+    sparse.csr_matrix(np.eye(81)[np.arange(81).reshape(9, 9)[::-1].ravel()]),
+    "x = 0.5 m",
 )
 
 
