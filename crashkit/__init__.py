@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from crashkit.api.model import Model as Model
     from crashkit.api.predict import load_model as load_model
     from crashkit.api.predict import predict as predict
+    from crashkit.api.scatter import scatter as scatter
     from crashkit.api.train import train as train
     from crashkit.api.validate import validate as validate
     from crashkit.dataset import bumper_data as bumper_data
@@ -64,6 +65,7 @@ _LAZY = {
     "open_dataset": "crashkit.dataset",
     "open_hierarchy": "crashkit.mesh.store",
     "predict": "crashkit.api.predict",
+    "scatter": "crashkit.api.scatter",
     "train": "crashkit.api.train",
     "validate": "crashkit.api.validate",
     "write_paraview": "crashkit.writers.paraview",

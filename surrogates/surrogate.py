@@ -112,6 +112,17 @@ class Surrogate:
         )
         return out[0] if np.ndim(parameters) == 1 else out
 
+    def predict_nodes(
+        self, parameters: ArrayLike, nodes: NDArray[np.int64], time: ArrayLike | None = None, level: int | None = None
+    ) -> NDArray[np.float32]:
+        """`predict_full` of several runs on some nodes of the full mesh: (run, state, some nodes, 3), m."""
+        number = self.number(level)
+        values, times = self.checked(parameters, time)
+        core = self.core
+        if isinstance(core, PodRegression):
+            return self.registration.undo(lambda x, t: core.displacement(x, t, number, nodes), values, times)
+        return np.asarray(self.predict_full(values, times, number)[:, :, nodes])
+
     def lift(self, states: NDArray[np.float32], level: int) -> NDArray[np.float32]:
         """(..., node of `level`, 3) -> (..., node of the full mesh, 3)"""
         if level == 0:

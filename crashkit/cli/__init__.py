@@ -28,6 +28,7 @@ COMMANDS = (
     "evaluate",
     "predict",
     "explore",
+    "scatter",
     "propose",
     "campaign",
     "export",

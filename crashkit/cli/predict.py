@@ -70,7 +70,7 @@ def command(
         fail("give one of --param, --params and --run", code=2)
     if bool(run) != (dataset is not None):
         fail("--run and --dataset belong together: --run run_008 --dataset crash.zarr", code=2)
-    asked = None if params is not None or run else _given(param or ())
+    asked = None if params is not None or run else given(param or ())
     times = _times(time)
     with Progress(f"reading {model}", quiet=json) as shown:
         from crashkit.api.predict_runs import predict_runs
@@ -110,14 +110,15 @@ def show(rows: list[PredictedRun]) -> None:
     look_in_paraview(first.files)
 
 
-def _given(texts: Iterable[str]) -> dict[str, str]:
+def given(texts: Iterable[str], option: str = "--param", example: str = "impact_speed=20") -> dict[str, str]:
+    """Texts name=value as a dictionary; bad usage where one is none."""
     out: dict[str, str] = {}
     for text in texts:
         name, equals, value = text.partition("=")
         if not equals or not name.strip() or not value.strip():
-            raise typer.BadParameter(f"{text!r}; expected name=value, such as impact_speed=20", param_hint="--param")
+            raise typer.BadParameter(f"{text!r}; expected name=value, such as {example}", param_hint=option)
         if name.strip() in out:
-            raise typer.BadParameter(f"{name.strip()} is given twice", param_hint="--param")
+            raise typer.BadParameter(f"{name.strip()} is given twice", param_hint=option)
         out[name.strip()] = value
     return out
 

@@ -73,6 +73,32 @@ class KeptNodes:
     edges: NDArray[np.integer]
 
 
+def field_picture(
+    points: ArrayLike,
+    faces: ArrayLike,
+    displacement: ArrayLike,
+    values: ArrayLike,
+    label: str,
+    sheet: Sheet | None = None,
+    colours: str = DISPLACEMENT,
+) -> Figure:
+    """A field on the deformed mesh.
+
+    Parameters
+    ----------
+    points
+        (n, 3) m; displacement (n, 3) m.
+    values
+        (n,) or (m,) in the unit that `label` names; shown between 0, or the smallest, and the largest.
+    """
+    sheet = sheet or Sheet()
+    position = np.asarray(points) + np.asarray(displacement)
+    scale = Scale(label, limits_of(values), colours)
+    view = choose_view([position], faces)
+    image = render(position, faces, view, values, scale.limits, colours, _pixels(sheet, 1))
+    return _sheet_of([[Panel(image)]], [scale], sheet)
+
+
 def comparison_picture(
     points: ArrayLike,
     faces: ArrayLike,

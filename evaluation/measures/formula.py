@@ -110,6 +110,18 @@ class Formula:
         """Whether it asks for displacements."""
         return any(isinstance(n, ast.Call) and _called(n)[0] in FIELDS for n in ast.walk(self.tree))
 
+    def nodes(
+        self, parts: Mapping[str, NDArray[np.int64]], place: Callable[[int], NDArray[np.int64]]
+    ) -> NDArray[np.int64] | None:
+        """The nodes that its first field speaks of; None: all. `place` gives that of the solver's node number."""
+        for node in _values(self.tree):
+            if isinstance(node, ast.Call) and _called(node)[0] in FIELDS:
+                words = {str(k.arg): _word(k.value, self.text) for k in node.keywords}
+                if "node" in words:
+                    return place(int(words["node"]))
+                return part_nodes(parts, words["part"]) if "part" in words else None
+        return None
+
     def value(self, runs: Runs, others: Mapping[str, Formula] | None = None) -> Value:
         """What it gives for `runs`.
 

@@ -102,11 +102,22 @@ class PodRegression:
         return np.ones(len(parameters))
 
     def displacement(
-        self, parameters: NDArray[np.float64], time: NDArray[np.float64], number: int = 0
+        self,
+        parameters: NDArray[np.float64],
+        time: NDArray[np.float64],
+        number: int = 0,
+        nodes: NDArray[np.int64] | None = None,
     ) -> NDArray[np.float32]:
-        """(run, p) and (state,) -> (run, state, node, 3), m"""
-        z = self.coefficients(parameters, time).astype(np.float32)
-        return (z.reshape(-1, z.shape[-1]) @ self.modes.T).reshape(*z.shape[:2], -1, 3)
+        """(run, p) and (state,) -> (run, state, node, 3), m; with `nodes` on these alone."""
+        return self.decoded(self.coefficients(parameters, time), nodes)
+
+    def decoded(self, z: NDArray[np.float64], nodes: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
+        """Coefficients (run, state, mode), m -> displacements (run, state, node, 3), m."""
+        modes = self.modes
+        if nodes is not None:
+            modes = modes.reshape(-1, 3, modes.shape[1])[nodes].reshape(-1, modes.shape[1])
+        flat = z.reshape(-1, z.shape[-1]).astype(np.float32)
+        return np.asarray(flat @ modes.T, np.float32).reshape(*z.shape[:2], -1, 3)
 
     def reconstruct(self, states: NDArray[np.float32], number: int = 0) -> NDArray[np.float32]:
         """(state, node, 3) projected on the modes."""

@@ -132,6 +132,33 @@ class Gaussian:
         unknown = (1 - solved.sum(axis=1)) ** 2 / ones.sum()
         return np.asarray(np.sqrt(np.maximum(self.kernel.at(x) - gain + unknown, 0) + self.kernel.noise))
 
+    def covariance(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(query, query): what the process believes of its errors together, in units of the outputs' spread, squared.
+
+        Source: Rasmussen and Williams 2006, equations 2.26 and 2.42; the noise of each run is on the diagonal.
+        """
+        if not self._informed:
+            return np.eye(len(x))
+        solved, ones = self._solved(x)
+        unknown = 1 - solved.sum(axis=1)
+        gain = solved @ self.kernel(np.atleast_2d(x), self.x).T
+        out = self.kernel(x, x) - (gain + gain.T) / 2 + np.outer(unknown, unknown) / ones.sum()
+        return np.asarray(out + self.kernel.noise * np.eye(len(x)))
+
+    def whitened(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(sample, output): outputs y whose columns the kernel explains as independent draws; their products are the outputs' spread.
+
+        A draw from the belief at queries x is chol(covariance(x)) E W, with W this and E (query, sample) of standard
+        normal numbers: all outputs share the kernel, and W'W is how they vary together.
+        """
+        from scipy.linalg import solve_triangular
+
+        if not self._informed:
+            return np.asarray((y - y.mean(axis=0)) / np.sqrt(max(1, len(y))))
+        factor, _ = self._factor()
+        mean, _ = self.expanded(y)
+        return np.asarray(solve_triangular(factor, y - mean, lower=True) / np.sqrt(len(y)))
+
     def _solved(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(query, sample): K^-1 k of each query, and (sample,): K^-1 1."""
         from scipy.linalg import cho_solve
