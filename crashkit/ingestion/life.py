@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.ingestion.structure import Structure
-from crashkit.readers.base import Run, RunMesh, split_states
+from crashkit.readers.base import Run, RunMesh
 from crashkit.readers.checks import reading
+from data_schema.blocks import split_states
 
 Flags = NDArray[np.bool_]
 Rows = NDArray[np.int64]

@@ -31,8 +31,9 @@ from crashkit.ingestion.store import ArraySpec, create_arrays
 from crashkit.ingestion.structure import Structure, matched
 from crashkit.ingestion.survey import Choice, Field, Found, reopen
 from crashkit.quality import Quality, look, measured
-from crashkit.readers.base import Run, split_states
+from crashkit.readers.base import Run
 from data_schema import unit_system
+from data_schema.blocks import split_states
 from data_schema.checksum import BlockDigest, array_digest, block_digest
 from data_schema.replace import put_in_place
 from data_schema.validation import FIRST_STATE_TOLERANCE
@@ -299,7 +300,7 @@ class _Transfer:
 
     def _pieces(self, state_bytes: int) -> list[tuple[int, int]]:
         """Ranges of own states whose values stay below `_PIECE_BYTES`."""
-        return list(split_states(len(self._own), -(-state_bytes // 12), _PIECE_BYTES))
+        return split_states(len(self._own), -(-state_bytes // 12), _PIECE_BYTES)
 
     def _put(self, spec: ArraySpec, block: Callable[[slice], Block], digests: dict[str, str]) -> None:
         """Write an array whose blocks `block` makes; several at a time, since most of the work is outside Python."""

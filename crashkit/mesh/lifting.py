@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.mesh.levels import Hierarchy
-from crashkit.readers.base import split_states
+from data_schema.blocks import split_states
 from data_schema.levels import lift
 
 # Bytes of displacement lifted at once.

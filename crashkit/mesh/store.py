@@ -27,7 +27,7 @@ from crashkit.errors import DataError, OutputError, ReadError
 from crashkit.mesh.levels import Hierarchy
 from crashkit.mesh.lifting import LiftingError, LiftingMeter
 from crashkit.netcdf import handle, open_netcdf, writing
-from crashkit.readers.base import split_states
+from data_schema.blocks import split_states
 from data_schema.levels import Level
 from data_schema.progress import Progress
 from data_schema.replace import beside, put_in_place, room_beside

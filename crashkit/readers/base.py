@@ -232,9 +232,3 @@ def distinct_parts(parts: Sequence[Part]) -> tuple[Part, ...]:
             used.add(part.id)
         out.append(part)
     return tuple(out)
-
-
-def split_states(count: int, nodes: int, budget: int = 64 << 20) -> Sequence[tuple[int, int]]:
-    """Ranges of states whose float32 xyz values stay below `budget` bytes each (at least one state)."""
-    step = max(1, budget // max(1, nodes * 12))
-    return [(k, min(k + step, count)) for k in range(0, count, step)]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from data_schema.blocks import split_states
 from evaluation.measures.distance import (
     Peak,
     compared,
@@ -28,9 +29,7 @@ _BLOCK = 48 << 20
 
 def state_blocks(states: int, nodes: int) -> Iterator[slice]:
     """Slices of states that are small enough to work on in one piece."""
-    step = max(1, _BLOCK // (12 * nodes))
-    for first in range(0, states, step):
-        yield slice(first, min(first + step, states))
+    return (slice(first, end) for first, end in split_states(states, nodes, _BLOCK))
 
 
 @dataclass(frozen=True)
