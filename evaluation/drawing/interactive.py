@@ -14,13 +14,14 @@ import json
 import os
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from data_schema.levels import Level
 from evaluation.drawing.pictures import DISPLACEMENT, ERROR
 from evaluation.drawing.rendering import choose_view, off_screen
 from evaluation.errors import EvaluationError
@@ -28,6 +29,7 @@ from evaluation.measures.projection import last_seen
 
 MAX_NODES = 10_000
 MAX_STATES = 31
+_FEWEST = 4  # a level is shown if it has at least this part of the nodes that may be shown
 _STEPS = 2**16 - 1
 _COLOURS = 64
 
@@ -43,6 +45,7 @@ def interactive_view(
     names: tuple[str, str] = ("truth", "prediction"),
     title: str = "truth and prediction",
     alive: ArrayLike | None = None,
+    levels: Sequence[Level] = (),
     max_nodes: int = MAX_NODES,
     max_states: int = MAX_STATES,
 ) -> str:
@@ -64,6 +67,8 @@ def interactive_view(
         (t, n, 3) displacements, m; NaN where nodes are gone.
     alive
         (t, m) bool, False once an element has eroded.
+    levels
+        The mesh's coarse levels, where there are any: one of them is shown in place of a mesh that is too large.
 
     Raises
     ------
@@ -81,7 +86,7 @@ def interactive_view(
     living = np.ones((len(chosen), len(corners)), bool) if alive is None else np.asarray(alive, bool)[chosen]
     errors = [_errors(a, b, len(x) > max_nodes) for a, b in zip(u, p, strict=True)]
 
-    x, corners, u, p, living = _thinned(x, corners, u, p, living, max_nodes)
+    x, corners, u, p, living = _thinned(x, corners, u, p, living, levels, max_nodes)
     there = np.asarray(np.isfinite(u).all(axis=-1))
     corners, living = _triangles(corners, living & (there[:, corners] | (corners < 0)).all(axis=-1))
     both = np.concatenate([x[None], x + last_seen(u), x[None], x + last_seen(p)])
@@ -139,16 +144,24 @@ def _thinned(
     u: NDArray[np.float64],
     p: NDArray[np.float64],
     living: NDArray[np.bool_],
+    levels: Sequence[Level],
     max_nodes: int,
 ) -> tuple[NDArray[np.float64], NDArray[Any], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     if len(x) <= max_nodes:
         return x, corners, u, p, living
-    from crashkit.mesh.hierarchy import build_hierarchy
+    fitting = [level for level in levels if max_nodes / _FEWEST <= level.n_nodes <= max_nodes]
+    if fitting:
+        kept, faces = fitting[0].kept, fitting[0].faces
+    else:
+        from crashkit.mesh.hierarchy import build_hierarchy
 
-    level = build_hierarchy(x, corners, [max_nodes])[1]
-    kept = level.kept
+        # From the coarsest level that is still too fine, which takes far less time than from the full mesh.
+        finer = [level for level in levels if level.n_nodes > max_nodes]
+        kept, faces = (finer[-1].kept, finer[-1].faces) if finer else (np.arange(len(x)), corners)
+        level = build_hierarchy(x[kept], faces, [max_nodes])[1]
+        kept, faces = kept[level.kept], level.faces
     # A coarse face stands for many; it is shown as long as its nodes are there.
-    return x[kept], level.faces, u[:, kept], p[:, kept], np.ones((len(u), len(level.faces)), bool)
+    return x[kept], faces, u[:, kept], p[:, kept], np.ones((len(u), len(faces)), bool)
 
 
 def _triangles(corners: NDArray[Any], living: NDArray[np.bool_]) -> tuple[NDArray[Any], NDArray[np.bool_]]:

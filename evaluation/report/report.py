@@ -59,7 +59,7 @@ _TEXT = (
     "interpolation error is the error of interpolating the true states back from the nodes of a coarse mesh.",
     "A band is an interval around the prediction that should contain 90 % of nodes and states; its width comes from "
     "the errors on runs the model had not seen. The table lists the share of the test runs' nodes and states within it.",
-    "Milliseconds are the fastest of nine repetitions on the machine named below, for all states of a run asked "
+    "Milliseconds are the fastest of up to nine repetitions on the machine named below, for all states of a run asked "
     "in one call "
     "and divided by their number, unless a column says otherwise.",
 )
@@ -181,7 +181,7 @@ def _views(evaluation: Evaluation) -> tuple[list[ShownView], str]:
         html = interactive_view(
             reference.position_of(run), reference.faces, reference.time, reference.displacement(run),
             evaluation.lifted(best, run), names=("truth", best.label), title=f"{reference.runs[run]}: {best.label}",
-            alive=None if reference.alive is None else reference.alive(run),
+            alive=None if reference.alive is None else reference.alive(run), levels=reference.levels,
         )  # fmt: skip
     except EvaluationError as error:
         return [], f"the interactive view ({error})"

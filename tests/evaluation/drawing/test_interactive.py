@@ -10,6 +10,7 @@ import zlib
 import numpy as np
 import pytest
 
+from crashkit.mesh.hierarchy import build_hierarchy
 from evaluation.drawing.interactive import interactive_view
 from evaluation.errors import EvaluationError
 
@@ -85,6 +86,17 @@ def test_states_and_nodes_are_bounded():
     assert "more than are shown" in run["errors"][0]
     exact = 100 * np.linalg.norm(p - u, axis=-1)[-1].max()
     assert f"largest {exact:.2f} cm" in run["errors"][-1]
+
+
+def test_a_level_that_is_there_is_shown_in_place_of_a_mesh_that_is_too_large():
+    x, faces = tube()
+    u, p = flight(len(x))
+    levels = build_hierarchy(x, faces, [90, 40, 12]).levels
+    for most, nodes in ((60, 40), (11, 11)):  # the level of 90 is too large, that of 12 has none below it
+        run = run_in(interactive_view(x, faces, TIME, u, p, max_states=2, max_nodes=most, levels=levels))
+        assert run["nodes"] == nodes
+        shown = positions(run, "truth")[-1]
+        assert np.linalg.norm(shown[:, None] - (x + u[-1])[None], axis=-1).min(axis=1).max() < 1e-3
 
 
 def test_eroded_faces_and_lost_nodes_are_hidden_from_their_state_on():
