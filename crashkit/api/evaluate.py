@@ -396,23 +396,10 @@ def as_model(surrogate: Surrogate, folder: Path, reference: Reference) -> Model:
         checksum=record.checksum,
         seed=record.seed,
         configuration=configuration,
-        known={name: told for name, told in record.physics.items() if isinstance(told, str)} | _near_folds(surrogate),
+        known={name: told for name, told in record.physics.items() if isinstance(told, str)},
         worth=record.physics.get("errors") or {},
+        hard=surrogate.hard_runs(),
     )
-
-
-def _near_folds(surrogate: Surrogate) -> dict[str, str]:
-    """A line on runs that differ from their neighbours by more than their distance explains, where there are any."""
-    found = surrogate.hard_runs()
-    if not found:
-        return {}
-    worst = ", ".join(
-        f"{run} ({100 * e:.2g} cm, {t:.1f} times the typical error)" for run, (e, t) in list(found.items())[:5]
-    )
-    more = f", and {len(found) - 5} more in its card" if len(found) > 5 else ""
-    return {
-        "near a fold": f"training runs that were predicted badly when left out, like others near them: {worst}{more}"
-    }
 
 
 def _own_mesh(surrogate: Surrogate, folder: Path, name: str, level: int, reference: Reference) -> Level | None:

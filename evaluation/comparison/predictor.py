@@ -90,6 +90,9 @@ class Model:
         What was put in before the first run, a sentence by its name: inputs, clock, symmetry.
     worth
         Error in cross-validation, m, with and without each of these.
+    hard
+        Training runs at places where runs differ by more than their distance explains, the worst first: the error when
+        left out, m, and how many times the typical one it is.
     """
 
     name: str
@@ -102,6 +105,7 @@ class Model:
     configuration: Mapping[str, object] = field(default_factory=dict)
     known: Mapping[str, str] = field(default_factory=dict)
     worth: Mapping[str, float] = field(default_factory=dict)
+    hard: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def array_names(models: Sequence[Model]) -> dict[tuple[str, str], str]:

@@ -108,14 +108,16 @@ def comparison_picture(
     sheet: Sheet | None = None,
     alive: ArrayLike | None = None,
     error_limits: Limits | None = None,
+    titles: tuple[str, str, str] | None = None,
 ) -> Figure:
     """Truth, prediction and error of one state, in one view; the first two in one scale.
 
     points (n, 3) m; truth and prediction (n, 3) displacements, m; alive (m,) bool. The error is the distance
     between predicted and true position of each node, shown on the true mesh. Behind the prediction stands the
-    truth as a grey shadow.
+    truth as a grey shadow. With `titles` they may be any two states and their distance.
     """
     sheet = sheet or Sheet()
+    shown = titles or ("truth", name, f"error of {name}" if name != "prediction" else "error")
     x, u, p = (np.asarray(a, np.float64) for a in (points, truth, prediction))
     if not x.shape == u.shape == p.shape:
         raise EvaluationError(
@@ -125,14 +127,14 @@ def comparison_picture(
     error = CM * np.linalg.norm(p - u, axis=-1)
     view = choose_view([x + u, x + p], faces)
     moved = Scale("displacement (cm)", limits_of(np.concatenate(sizes)), DISPLACEMENT)
-    wrong = Scale("error (cm)", error_limits or limits_of(error), ERROR)
+    wrong = Scale("error (cm)" if titles is None else "distance (cm)", error_limits or limits_of(error), ERROR)
     width = _pixels(sheet, 1 if sheet.narrow else 3)
     panels = [
         Panel(render(x + a, faces, view, values, s.limits, s.colours, width, alive=alive, ghost=ghost), title)
         for a, values, s, title, ghost in (
-            (u, sizes[0], moved, "truth", None),
-            (p, sizes[1], moved, name, x + u),
-            (u, error, wrong, f"error of {name}" if name != "prediction" else "error", None),
+            (u, sizes[0], moved, shown[0], None),
+            (p, sizes[1], moved, shown[1], x + u),
+            (u, error, wrong, shown[2], None),
         )
     ]
     rows = [[panel] for panel in panels] if sheet.narrow else [panels]

@@ -29,6 +29,7 @@ ORDER = (
     "worst",
     "map",
     "parameters",
+    "folds",
     "parts",
     "regions",
     "rigid",

@@ -22,7 +22,7 @@ from evaluation.report.files import write_run
 from evaluation.report.page import plain, show_table
 from evaluation.report.report import write_report
 
-PICTURES = ("worst", "map", "contributions", "meshes", "paraview")
+PICTURES = ("worst", "map", "folds", "contributions", "meshes", "paraview")
 
 
 class _Page(HTMLParser):
