@@ -9,7 +9,7 @@ from crashkit.errors import CrashkitError
 
 # Extra -> the modules it brings that crashkit imports. `[project.optional-dependencies]` in pyproject.toml has their packages.
 MODULES = {
-    "train": ("torch", "sklearn", "safetensors", "threadpoolctl"),
+    "train": ("torch", "sklearn", "safetensors", "threadpoolctl", "nautilus"),
     "report": ("matplotlib", "jinja2", "objective_rating_metrics"),
     "formats": ("meshio", "openpyxl"),
     "viewer": ("trame_vtk",),

@@ -108,7 +108,7 @@ class Surrogate:
         if number == 0 or isinstance(self.core, PodRegression):
             return self.lift(self.predict(parameters, times, number), number)
         out = self.registration.undo(
-            lambda x, t: self._by_network(x, t, number, lambda states: self._lifted(states, number)), values, times
+            lambda x, t: self.by_network(x, t, number, lambda states: self._lifted(states, number)), values, times
         )
         return out[0] if np.ndim(parameters) == 1 else out
 
@@ -312,9 +312,9 @@ class Surrogate:
         """What the core says of registered inputs (batch, input) at registered times: (batch, state, node, 3)."""
         if isinstance(self.core, PodRegression):
             return self.core.displacement(inputs, time, number)
-        return self._by_network(inputs, time, number)
+        return self.by_network(inputs, time, number)
 
-    def _by_network(
+    def by_network(
         self,
         parameters: NDArray[np.float64],
         time: NDArray[np.float64],

@@ -95,6 +95,10 @@ class PodRegression:
         out = np.concatenate([self.machine.weights(p) @ known for p in _pieces(points)])
         return out.reshape(len(x), len(time), r)
 
+    def weights(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(run, p) -> (run, training sample): how much each training run enters, where a run is one sample."""
+        return self.machine.weights(self._scaled(parameters))
+
     def deviation(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
         """(run, p) -> (run,): what the process believes its error to be, up to a factor; ones where it believes nothing."""
         if self.inputs == "trajectory" and isinstance(self.machine, Gaussian):

@@ -82,6 +82,7 @@ class Gaussian:
         self.kernel = kernel or Kernel(1.0, 0.3, 1e-2, np.eye(self.x.shape[1]) / 2)
         self.mixed = tuple(mixed)
         self.likelihood = -np.inf
+        self._factored: tuple[Kernel, tuple[NDArray[np.float64], bool]] | None = None
 
     def fit(self, y: NDArray[np.float64], seed: int, start: Kernel | None = None) -> Gaussian:
         """Set the kernel by the likelihood of the outputs y (sample, output), in units of their spread.
@@ -170,9 +171,12 @@ class Gaussian:
     def _factor(self) -> tuple[NDArray[np.float64], bool]:
         from scipy.linalg import cho_factor
 
+        if self._factored is not None and self._factored[0] is self.kernel:
+            return self._factored[1]
         noise = self.kernel.noise + _JITTER
         factor, lower = cho_factor(self.kernel(self.x, self.x) + noise * np.eye(len(self.x)), lower=True)
-        return np.asarray(factor), bool(lower)
+        self._factored = self.kernel, (np.asarray(factor), bool(lower))
+        return self._factored[1]
 
     @property
     def _informed(self) -> bool:
