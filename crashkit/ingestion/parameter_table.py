@@ -118,7 +118,7 @@ def read_parameter_table(path: Path) -> ParameterTable:
     DataError
         Naming a run with two rows.
     """
-    table = _load(path)
+    table = _load(path, _KEYS)
     keys = next((found for name in _KEYS if (found := _called(table.header, name))), [])
     if len(keys) > 1:
         told = " and ".join(repr(table.header[k]) for k in keys)
@@ -181,7 +181,43 @@ class _Table:
     lines: list[tuple[int, list[Any]]]
 
 
-def _load(path: Path) -> _Table:
+@dataclass(frozen=True)
+class Numbers:
+    """A table of numbers: (name, unit) of each column, and (row in the file, values); NaN where a cell is empty."""
+
+    columns: tuple[tuple[str, str], ...]
+    rows: tuple[tuple[int, tuple[float, ...]], ...]
+
+
+def read_numbers(path: Path, keys: Sequence[str]) -> Numbers:
+    """A table of which every column holds numbers, such as measured points; one of `keys` stands in its header.
+
+    Raises
+    ------
+    ReadError
+        With the row and column of what cannot be understood.
+    """
+    table = _load(path, keys)
+    every = range(len(table.header))
+    columns = parameter_columns(table.header, [""] * len(table.header), str(path))
+    first = next((k for name in keys for k in _called(table.header, name)), 0)
+    body, below = _without_units_row(table, first, [k for k in every if k != first])
+    mark = _decimal_mark(body, every, path)
+    rows = [
+        (
+            number,
+            tuple(
+                math.nan if _text(line[k]) in ("", "-", "nan", "NaN") else
+                _number(line[k], mark, f"{path}: row {number}, column {table.header[k]!r}")
+                for k in every
+            ),
+        )
+        for number, line in body
+    ]  # fmt: skip
+    return Numbers(tuple((n, u or below.get(k, "")) for k, (n, u) in enumerate(columns)), tuple(rows))
+
+
+def _load(path: Path, keys: Sequence[str]) -> _Table:
     if not path.is_file():
         raise ReadError(f"{path}: no such parameter table")
     suffix = path.suffix.lower()
@@ -191,7 +227,7 @@ def _load(path: Path) -> _Table:
         raise ReadError(f"{path}: has {path.stat().st_size >> 20} MB; expected a table with a row a run, below 64 MB")
     read = {".json": _json_rows, ".xlsx": _workbook_rows, ".csv": _text_rows, ".tsv": _text_rows}[suffix]
     try:
-        lines = read(path)
+        lines = read(path, keys)
     except ReadError:
         raise
     except Exception as error:  # each library below has errors of its own
@@ -201,7 +237,7 @@ def _load(path: Path) -> _Table:
     if not lines:
         raise ReadError(f"{path}: cannot be read as a table (it is empty)")
     above = next(
-        (k for k, (_, line) in enumerate(lines[:_TITLE_ROWS]) if any(_plain(_text(c)) in _KEYS for c in line)), 0
+        (k for k, (_, line) in enumerate(lines[:_TITLE_ROWS]) if any(_plain(_text(c)) in keys for c in line)), 0
     )
     header = [_text(cell) for cell in lines[above][1]]
     width = max(len(line) for _, line in lines[above:])
@@ -228,7 +264,7 @@ def _plain(title: str) -> str:
     return re.sub(r"\W+", "", title).lower()
 
 
-def _text_rows(path: Path) -> list[tuple[int, list[Any]]]:
+def _text_rows(path: Path, keys: Sequence[str]) -> list[tuple[int, list[Any]]]:
     text = _decoded(path.read_bytes(), path)
     lines = text.splitlines()
     separator = ""
@@ -238,7 +274,7 @@ def _text_rows(path: Path) -> list[tuple[int, list[Any]]]:
     lines = ["" if line.lstrip().startswith("#") else line for line in lines]
     if not separator:
         # That of the header, which is the first line that names the column of the runs.
-        pattern = re.compile(rf'(?:^|[,;\t|])\s*"?(?:{"|".join(_KEYS)})"?\s*(?:[,;\t|]|$)', re.IGNORECASE)
+        pattern = re.compile(rf'(?:^|[,;\t|])\s*"?(?:{"|".join(keys)})"?\s*(?:[,;\t|\[( ]|$)', re.IGNORECASE)
         header = next((line for line in lines[:_TITLE_ROWS] if pattern.search(line)), next(filter(None, lines), ""))
         separator = max(";\t|,", key=header.count)
     reader = csv.reader(io.StringIO("\n".join(lines)), delimiter=separator, skipinitialspace=True, strict=True)
@@ -259,7 +295,7 @@ def _decoded(content: bytes, path: Path) -> str:
     return text
 
 
-def _workbook_rows(path: Path) -> list[tuple[int, list[Any]]]:
+def _workbook_rows(path: Path, keys: Sequence[str]) -> list[tuple[int, list[Any]]]:
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as packed:
             size = sum(entry.file_size for entry in packed.infolist())
@@ -273,7 +309,7 @@ def _workbook_rows(path: Path) -> list[tuple[int, list[Any]]]:
     with_runs = [
         title
         for title, lines in sheets.items()
-        if any(_plain(_text(cell)) in _KEYS for _, line in lines[:_TITLE_ROWS] for cell in line)
+        if any(_plain(_text(cell)) in keys for _, line in lines[:_TITLE_ROWS] for cell in line)
     ]
     if len(with_runs) > 1:
         raise ReadError(
@@ -295,7 +331,7 @@ def _sheet_rows(sheet: Any) -> list[tuple[int, list[Any]]]:
     return [(number, row) for number, row in rows if any(cell is not None for cell in row)]
 
 
-def _json_rows(path: Path) -> list[tuple[int, list[Any]]]:
+def _json_rows(path: Path, keys: Sequence[str]) -> list[tuple[int, list[Any]]]:
     def distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         twice = next((name for name, times in Counter(name for name, _ in pairs).items() if times > 1), None)
         if twice is not None:
