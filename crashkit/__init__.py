@@ -16,6 +16,8 @@ from crashkit.version import __version__ as __version__
 if TYPE_CHECKING:
     from crashkit.api.coarsen import coarsen as coarsen
     from crashkit.api.evaluate import evaluate as evaluate
+    from crashkit.api.invert import Inversion as Inversion
+    from crashkit.api.invert import invert as invert
     from crashkit.api.model import Model as Model
     from crashkit.api.predict import load_model as load_model
     from crashkit.api.predict import predict as predict
@@ -49,6 +51,7 @@ _LAZY = {
     "EvaluationError": "evaluation.errors",
     "Hierarchy": "crashkit.mesh.levels",
     "IngestSummary": "crashkit.ingestion.ingest",
+    "Inversion": "crashkit.api.invert",
     "MeshError": "crashkit.errors",
     "Model": "crashkit.api.model",
     "OutputError": "crashkit.errors",
@@ -61,6 +64,7 @@ _LAZY = {
     "evaluate": "crashkit.api.evaluate",
     "from_arrays": "crashkit.ingestion.arrays",
     "ingest": "crashkit.ingestion.ingest",
+    "invert": "crashkit.api.invert",
     "load_model": "crashkit.api.predict",
     "open_dataset": "crashkit.dataset",
     "open_hierarchy": "crashkit.mesh.store",

@@ -29,6 +29,7 @@ COMMANDS = (
     "predict",
     "explore",
     "scatter",
+    "invert",
     "propose",
     "campaign",
     "export",
