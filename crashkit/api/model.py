@@ -103,8 +103,8 @@ class Model:
             `displacement` (time, node, xyz), m, with `sim` in front for several runs; the parameters; and the mesh, so
             that `prediction.crash.to_pyvista(time=0.02).plot()` draws it. The coordinate `node` says which node of
             the full mesh each one is. Attributes: `model`, `level`, and `warnings`: what lies outside the trained
-            range or near a fold, where neighbouring runs differ by more than their distance explains. Each is a Python
-            warning, too.
+            range or near a fold, where neighbouring runs differ by more than their distance explains, one
+            per line. Each is a Python warning, too.
 
         Raises
         ------
@@ -174,7 +174,7 @@ class Model:
             attrs={
                 "model": next(name for name, k in self.levels.items() if k == number),
                 "level": 0 if full else number,
-                "warnings": "; ".join(unsure),
+                "warnings": "\n".join(unsure),
             },
         )
         if not several:

@@ -196,7 +196,7 @@ def _predicted(wanted: _Wanted, prediction: xr.Dataset, files: list[Path], recor
     import numpy as np
 
     known = wanted.truth is not None
-    sentences = [s for s in str(prediction.attrs["warnings"]).split("; ") if s]
+    sentences = str(prediction.attrs["warnings"]).splitlines()
     for seen, what in ((record.fitted_runs, "trained"), (record.validation_runs, "tuned")):
         if known and wanted.run in seen:
             sentences.append(f"the model was {what} on {wanted.run}; its error there says nothing about new runs")

@@ -340,7 +340,8 @@ def _scatters(
     nominal = parameter_values({**middle, **at}, ranges)
     far = far_outside(ranges, nominal[None], np.array(ranges.time))
     if far:
-        said = "; ".join(ranges.outside(nominal, np.array(ranges.time)))
+        beyond = ranges.beyond(nominal, np.array(ranges.time))
+        said = "; ".join(beyond[name] for name in far)
         raise DataError(f"{said}: that is far outside, and nothing is known there; check the value and its unit")
     out = []
     for name, given in vary.items():

@@ -280,6 +280,16 @@ def test_outside_the_trained_range_there_is_a_warning_with_the_range(model: Path
     assert f"warning: impact_speed = {speed:g} m s-1 is outside the trained range" in err
 
 
+def test_a_warning_with_a_semicolon_is_one_warning(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said = ["near a fold: wrong about run_003; compute a run", "and another"]
+    monkeypatch.setattr("surrogates.surrogate.Surrogate.hard", lambda *_: said)
+    code, out, _ = run(*asked(model), "-o", tmp_path / "run.npz", "--json")
+    assert code == 0
+    assert json.loads(out)["warnings"] == said
+
+
 def test_far_outside_nothing_is_predicted_unless_asked(model: Path, tmp_path: Path) -> None:
     rest = asked(model)[4:]
     far = ("predict", model, "--param", "impact_speed=99", *rest, "-o", tmp_path / "run.npz")
