@@ -59,6 +59,15 @@ def test_validation_runs_train_nothing(model: str, overrides: tuple[str, ...]) -
         assert two.record.errors[name] != one.record.errors[name]
 
 
+def test_ranges_are_those_of_the_runs_that_train() -> None:
+    mu = plate.parameters(8)
+    fastest = int(mu[:, 0].argmax())
+    chosen = settings("podnn", overrides=["level.epochs=1", f"validation.runs=[run_{fastest:03d}]"])
+    ranges = train_surrogate(plate.campaign(8), chosen).record.ranges
+    np.testing.assert_array_equal(ranges.high, np.delete(mu, fastest, axis=0).max(axis=0))
+    assert ranges.high[0] < mu[fastest, 0]
+
+
 @pytest.mark.parametrize(("model", "times"), [("pod-gpr", 2), ("podnn", 1)])
 def test_a_band_is_calibrated_on_each_left_out_run_by_what_the_model_says_of_it(
     monkeypatch: pytest.MonkeyPatch, model: str, times: int
