@@ -13,8 +13,13 @@ from data_schema.mirror import MirrorPlane
 from surrogates.data.campaign import Campaign
 from surrogates.data.samples import Notes
 from surrogates.errors import SurrogateError
+<<<<<<< HEAD
 from surrogates.physics.choice import _Search, choose, of_campaign
 from surrogates.physics.derived import SPEED, STRESS
+=======
+from surrogates.physics.choice import _Search, _Way, choose, not_used, of_campaign
+from surrogates.physics.derived import SPEED, STRESS, logarithms
+>>>>>>> bd50b0b (Changelog: odd parameters, corners of the trained range, resuming)
 from surrogates.physics.trials import Folds, Trials, courses_of
 from surrogates.settings import Settings, settings
 from surrogates.surrogate import Surrogate
@@ -132,6 +137,11 @@ def test_a_parameter_declared_odd_is_never_put_in_a_logarithm_even_if_positive_i
     assert mirrored
     assert all(not column.logarithm for way in mirrored for column in way.inputs.columns if column.powers[1])
     assert all(np.isfinite(search.error(way)) for way in mirrored)
+    named = {bool(powers[1]) for way in mirrored for i in search.monomials(way) for powers in (c.powers for c in i.columns)
+             if sum(map(bool, powers)) > 1}  # fmt: skip
+    assert named == {False}  # nor in a monomial with others
+    even = _Way(logarithms(of.parameter_names, of.parameters, warp=True))
+    assert any(c.powers[1] and c.powers[0] for i in search.monomials(even) for c in i.columns)
 
 
 def test_a_parameter_declared_odd_on_a_mesh_without_a_mirror_plane_is_named() -> None:
