@@ -13,13 +13,8 @@ from data_schema.mirror import MirrorPlane
 from surrogates.data.campaign import Campaign
 from surrogates.data.samples import Notes
 from surrogates.errors import SurrogateError
-<<<<<<< HEAD
-from surrogates.physics.choice import _Search, choose, of_campaign
-from surrogates.physics.derived import SPEED, STRESS
-=======
-from surrogates.physics.choice import _Search, _Way, choose, not_used, of_campaign
+from surrogates.physics.choice import _Search, _Way, choose, of_campaign
 from surrogates.physics.derived import SPEED, STRESS, logarithms
->>>>>>> bd50b0b (Changelog: odd parameters, corners of the trained range, resuming)
 from surrogates.physics.trials import Folds, Trials, courses_of
 from surrogates.settings import Settings, settings
 from surrogates.surrogate import Surrogate
