@@ -157,7 +157,32 @@ def evaluate(
         if output is not None:
             with _counted(tell, "figures", len(kinds())) as step:
                 write_report(result, folder, done=lambda name: step(0))
+    _note_bands(asked, result)
     return result
+
+
+def _note_bands(asked: Sequence[tuple[str, Trained | Path]], result: Evaluation) -> None:
+    """Beside each stored model: what share of the test runs its band held, which `predict` tells with later bands."""
+    import numpy as np
+
+    from surrogates.storage.tested import Held, note_held
+
+    of_model: dict[int, dict[str, Held]] = {}
+    for entry in result.entries:
+        for (model, _), predictor, covered in zip(
+            entry.keys,
+            (result.predictor(entry, k) for k in range(len(entry.keys))),
+            result.scores[entry.label].covered,
+            strict=True,
+        ):
+            known = covered[np.isfinite(covered)]
+            if len(known):
+                of_model.setdefault(model, {})[predictor.name] = Held(float(known.mean()), len(known))
+    for model, held in of_model.items():
+        given = asked[model][1]
+        folder = given if isinstance(given, Path) else given.folder
+        if folder is not None:
+            note_held(folder, held)
 
 
 def _folder(output: str | Path | None) -> contextlib.AbstractContextManager[Path]:

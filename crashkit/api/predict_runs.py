@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,32 @@ if TYPE_CHECKING:
     from crashkit.api.model import Model
     from surrogates.record import Record
     from surrogates.surrogate import Surrogate
+
+
+@dataclass(frozen=True)
+class PredictedBand:
+    """How wide a band is, what it comes from, and what it held.
+
+    Attributes
+    ----------
+    share
+        Of nodes and states that it should contain.
+    mean_half_width_m, largest_half_width_m
+        m, over nodes and states.
+    runs_behind
+        Left-out runs whose errors it comes from.
+    inside
+        Share of the nodes and states of a run that is known that lie within it; None for others.
+    on_test_runs
+        What a band of 90 % held in the last evaluation, in words; None where the model was not evaluated.
+    """
+
+    share: float
+    mean_half_width_m: float
+    largest_half_width_m: float
+    runs_behind: int
+    inside: float | None = None
+    on_test_runs: str | None = None
 
 
 @dataclass(frozen=True)
@@ -43,6 +69,8 @@ class PredictedRun:
         m, over the nodes and states of a run that is known; None for others.
     relative_error
         The mean error over the mean true displacement.
+    band
+        Of the band that was asked for, if one was.
     """
 
     run: str
@@ -57,6 +85,7 @@ class PredictedRun:
     mean_error_m: float | None = None
     largest_error_m: float | None = None
     relative_error: float | None = None
+    band: PredictedBand | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """As plain values, without those that are None."""
@@ -135,8 +164,32 @@ def predict_runs(
             prediction = beside_truth(prediction, truth)
         about = {"model_name": f"{prediction.attrs['model']} of {asked.name}"}
         files = write_prediction(prediction, wanted.output, about | ({"run": wanted.run} if wanted.run else {}))
-        rows.append(_predicted(wanted, prediction, files, asked.record))
+        row = _predicted(wanted, prediction, files, asked.record)
+        rows.append(row if band is None else replace(row, band=_band(prediction, band, asked)))
     return rows
+
+
+def _band(prediction: xr.Dataset, share: float, model: Model) -> PredictedBand:
+    import numpy as np
+
+    from surrogates.storage.tested import held_on_tests
+
+    width, surrogate = prediction["half_width"].values, model.surrogate
+    name, full = str(prediction.attrs["model"]), prediction.attrs["level"] == 0
+    number = surrogate.level_names[name]
+    inside = None
+    if "error" in prediction:
+        error = prediction["error"].values
+        inside = float((error <= width)[np.isfinite(error)].mean())
+    held = None if model.folder is None or not full else held_on_tests(model.folder).get(name)
+    return PredictedBand(
+        share=share,
+        mean_half_width_m=float(np.nanmean(width)),
+        largest_half_width_m=float(np.nanmax(width)),
+        runs_behind=surrogate.bands[number, full and number > 0].runs,
+        inside=inside,
+        on_test_runs=None if held is None else held.told,
+    )
 
 
 def _wanted(

@@ -13,7 +13,7 @@ from crashkit.cli._console import fail, look_in_paraview, numbers, print_json, s
 from crashkit.cli._progress import Progress
 
 if TYPE_CHECKING:
-    from crashkit.api.predict_runs import PredictedRun
+    from crashkit.api.predict_runs import PredictedBand, PredictedRun
 
 
 def command(
@@ -107,7 +107,18 @@ def show(rows: list[PredictedRun]) -> None:
             f"error: mean {100 * first.mean_error_m:.2f} cm, {100 * first.relative_error:.1f} % of the motion, "
             f"largest of any node {100 * first.largest_error_m:.1f} cm"
         )
+    if first.band is not None:
+        _show_band(first.band)
     look_in_paraview(first.files)
+
+
+def _show_band(band: PredictedBand) -> None:
+    say(
+        f"band: {100 * band.share:g} % of nodes and states within {100 * band.mean_half_width_m:.2f} cm on average, "
+        f"{100 * band.largest_half_width_m:.1f} cm at most, from the errors on {band.runs_behind} left-out runs"
+        + (f"; of this run {100 * band.inside:.0f} % lie inside" if band.inside is not None else "")
+    )
+    say(band.on_test_runs or "whether the band holds on test runs is not known yet: crashkit evaluate tells")
 
 
 def given(texts: Iterable[str], option: str = "--param", example: str = "impact_speed=20") -> dict[str, str]:

@@ -21,7 +21,7 @@ FEW_RUNS = 10  # fewer test runs than this carry no reliable ranking of close mo
 NEAR = 1.25  # "nearly as exact": at most a quarter worse than the best
 # Share of the mean error: a larger displacement in the first state, where nothing has moved, gives a warning.
 START_SHARE = 0.1
-BAND_HOLDS = 0.8  # a 90 % band that holds less than this share on test runs gives a warning
+BAND_HOLDS = 0.85  # a 90 % band that holds less than this share on test runs gives a warning
 OUTLIER = 2.0  # a test run whose error is more than this many times the median gives a warning
 MOSTLY_REGRESSION, MOSTLY_COMPRESSION = 0.5, 0.8  # shares of the error that compression alone has
 POOR_RELATIVE = 0.15  # a relative displacement error above this gives a warning

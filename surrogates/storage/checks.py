@@ -98,9 +98,13 @@ def check_record(record: Record) -> None:
         raise SurrogateError(f"ranges do not fit the {count} parameters")
     if not all(np.isfinite(factor) and factor > 0 for _, factor in ranges.written):
         raise SurrogateError("ranges.table holds a unit without a value")
-    time = numbers("time", record.time, (None,))
+    _check_times("time", record.time)
+
+
+def _check_times(what: str, values: Any) -> None:
+    time = numbers(what, values, (None,))
     if not len(time) or (np.diff(time) <= 0).any():
-        raise SurrogateError("time is not increasing")
+        raise SurrogateError(f"{what}: not increasing")
 
 
 def check_labels(labels: Labels | None, n_nodes: int, n_faces: int) -> None:
@@ -136,6 +140,7 @@ def check_core(core: Network | PodRegression, graphs: Graphs) -> None:
     if isinstance(core, PodRegression):
         numbers("modes", core.modes, (3 * graphs.n_full, None))
         runs, states = core.data.parameters.shape[0], len(core.data.time)
+        _check_times("times of the modes", core.data.time)
         numbers("values", core.data.values, (runs, states, core.modes.shape[1]))
         numbers("parameters", core.data.parameters, (runs, None))
         if core.samples is not None:

@@ -29,6 +29,7 @@ from crashkit.writers.paraview import read_state
 from data_schema.levels import Level
 from surrogates.settings import settings
 from surrogates.storage.folder import load
+from surrogates.storage.tested import Held, note_held
 from surrogates.surrogate import Surrogate
 from surrogates.training.train import train_surrogate
 
@@ -253,7 +254,15 @@ def test_bands_and_sensitivities_are_written_beside_the_prediction(crash: Path, 
     code, out, err = run(*asked(tmp_path / "m"), "--full", "--band", 0.8, "--sensitivity", "--json", "-o", told)
     assert code == 0, err
     names = [f"displacement_by_{name}" for name in UNITS]
-    assert json.loads(out)["arrays"] == ["displacement", "half_width", *names]
+    told_band = json.loads(out)
+    assert told_band["arrays"] == ["displacement", "half_width", *names]
+    widths = surrogate.band(0.8, full=True, parameters=np.array([20.0, 5.0, 4e8]))
+    assert told_band["band"]["mean_half_width_m"] == pytest.approx(float(widths.mean()), rel=1e-4)
+    assert told_band["band"]["runs_behind"] == surrogate.bands[1, True].runs
+    note_held(tmp_path / "m", {"MH1": Held(0.5, 3)})
+    err = run(*asked(tmp_path / "m"), "--full", "--band", 0.8, "-o", tmp_path / "again.npz")[2]
+    assert "band: 80 % of nodes and states within" in err
+    assert "on 3 test runs the 90 % band held 50 % of nodes and states: it is too narrow" in err
     mu, step = np.array([20.0, 5.0, 4e8]), np.array([0.01, 0.0, 0.0])
     slope = (surrogate.predict_full(mu + step) - surrogate.predict_full(mu - step)) / 0.02
     with np.load(told) as stored:

@@ -102,6 +102,17 @@ def test_a_band_that_lacks_quantiles_or_a_unit_is_refused(stored: Path, tmp_path
         load(altered(stored, tmp_path / "m", "bands.safetensors", change))
 
 
+def test_times_that_stand_still_are_refused(stored: Path, tmp_path: Path) -> None:
+    if not (stored / "pod.safetensors").exists():
+        pytest.skip("networks know no times")
+
+    def change(tensors: dict[str, torch.Tensor]) -> None:
+        tensors["time"] = torch.zeros_like(tensors["time"])
+
+    with pytest.raises(ModelFolderError, match="times of the modes: not increasing"):
+        load(altered(stored, tmp_path / "m", "pod.safetensors", change))
+
+
 def _deep() -> Any:
     out: Any = []
     for _ in range(300):
