@@ -254,7 +254,7 @@ def _predicted(wanted: _Wanted, prediction: xr.Dataset, files: list[Path], recor
         if known and wanted.run in seen:
             sentences.append(f"the model was {what} on {wanted.run}; its error there says nothing about new runs")
     moved = prediction["predicted" if known else "displacement"].values
-    errors: dict[str, float] = {}
+    errors: dict[str, Any] = {}
     if known:
         error = prediction["error"].values
         motion = np.linalg.norm(prediction["displacement"].values, axis=-1)
