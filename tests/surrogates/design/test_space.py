@@ -84,6 +84,17 @@ def test_a_batch_does_not_cluster_and_keeps_away_from_what_is_known() -> None:
     assert apart.min() > 0.5
 
 
+def test_a_batch_is_what_is_asked_for_one_after_the_other() -> None:
+    candidates = np.concatenate([GRID[::7], GRID[::7] + 0.01])  # two of everything: the second brings nothing any more
+    alone = ExpectedReduction(_posterior(np.array([[0.1, 0.2]])), GRID)
+    expected = []
+    for _ in range(4):
+        expected.append(alone.ask(candidates, 1)[0])
+        alone.tell(expected[-1])
+    batch = ExpectedReduction(_posterior(np.array([[0.1, 0.2]])), GRID).ask(candidates, 4)
+    np.testing.assert_array_equal(batch, expected)
+
+
 def test_a_weighted_corner_is_asked_for_first() -> None:
     weights = np.exp(-((GRID - [0.75, 0.75]) ** 2).sum(axis=1) / 0.1)
     chosen = ExpectedReduction(_posterior(np.array([[0.0, 0.0]])), GRID, weights).ask(GRID, 1)
@@ -98,9 +109,20 @@ def test_told_points_count_as_computed() -> None:
 
 
 def test_the_error_over_the_box_is_the_deviation_there_times_the_ratio_at_left_out_runs() -> None:
-    found = judge(np.array([2.0, 3.0, 4.0, 3.0]), np.array([1.0, 1.0, 1.0, 1.0]), np.array([0.5, 1.5]), 0.9)
-    assert found.error == pytest.approx(3.0)
-    assert found.low < 3.0 < found.high
+    errors, deviations = np.array([1.0, 3.0, 8.0, 3.0]), np.array([0.5, 1.0, 2.0, 1.0])
+    found = judge(errors, deviations, np.array([1.0, 3.0]), 0.9)
+    assert found.error == pytest.approx(2.0 * np.mean([2, 3, 4, 3]))
+    assert found.low < found.error < found.high
+    assert found.below(2 * found.high)
+    assert not found.below(found.error)  # half of the resamples lie above it
+
+
+def test_an_interval_of_few_runs_is_wider_by_t_against_normal_quantiles() -> None:
+    """Two runs: a resample's mean is one of them, or, half of the time, the mean of both."""
+    found = judge(np.array([1.0, 3.0]), np.ones(2), np.ones(3), 0.9)
+    wider = 6.313752 / 1.644854  # 95 % quantiles of t with one degree of freedom, and of the normal distribution
+    assert (found.low, found.high) == pytest.approx((2 * 0.5**wider, 2 * 1.5**wider), rel=1e-5)
+    assert (found.runs, found.confidence) == (2, 0.9)
 
 
 @given(st.integers(0, 30))
