@@ -27,7 +27,7 @@ def chunk(n_nodes: int) -> int:
 
 def pieces(batch: int, n_nodes: int) -> int:
     """Into how many pieces a batch is cut, so that what a gradient needs stays small."""
-    return max(1, -(-batch * n_nodes // _NODES_IN_TRAINING))
+    return max(1, min(batch, -(-batch * n_nodes // _NODES_IN_TRAINING)))
 
 
 @dataclass

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from surrogates.data.campaign import Labels
 from surrogates.doubt import BandDoubt, ProcessDoubt, doubt_of
 from surrogates.settings import settings
 from surrogates.training.train import train_surrogate
+from surrogates.uncertainty import Spread
 
 VARY = {"impact_speed": "5%", "impact_angle": "2degree"}
 CENTRE = plate.SIDES[0] ** 2 // 2
@@ -148,8 +150,10 @@ def test_errors_drawn_from_the_posterior_are_as_large_as_those_on_runs_that_were
     np.testing.assert_allclose(some, doubt.draw(3, slice(None), nodes)[5:9][:, :, 10:14], atol=1e-6)
 
 
-def test_a_model_without_a_posterior_is_doubted_by_its_band() -> None:
+@pytest.mark.parametrize("spread", ["size", "local"])
+def test_a_model_without_a_posterior_is_doubted_by_its_band(spread: Spread) -> None:
     surrogate = train_surrogate(plate.campaign(16), settings("pod-rbf"))
+    surrogate.bands[0, False] = replace(surrogate.bands[0, False], spread=spread, local=surrogate.local_errors())
     runs = plate.parameters(4, seed=9)
     doubt = doubt_of(surrogate, runs, plate.TIME, 400, 0, 0)
     assert isinstance(doubt, BandDoubt)

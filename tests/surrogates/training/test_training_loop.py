@@ -18,6 +18,7 @@ from surrogates.settings import LevelSettings, settings
 from surrogates.training import loop
 from surrogates.training.checkpoints import Checkpoints
 from surrogates.training.loop import Diverged, Epoch, Objective, device_of, fit, learning_rates, set_up
+from surrogates.training.objectives import pieces
 from surrogates.training.train import train_surrogate
 
 SETTINGS = LevelSettings(epochs=12, batch=8, learning_rate=0.05, schedule="one_cycle")
@@ -276,6 +277,21 @@ def test_the_losses_are_weighted_in_the_step_as_well(
     chosen = plain(weight_approximation=approximation, weight_reconstruction=reconstruction)
     fit(objective, chosen, name="x", seed=0)
     assert float(objective.weight.detach()) == pytest.approx(-0.5 * gradient)
+
+
+def test_a_batch_in_pieces_learns_what_the_whole_one_does() -> None:
+    """Pieces of 3, 3 and 2 samples: each counts by its size."""
+    whole, cut = Line(), Line()
+    cut.pieces = lambda batch: 3  # type: ignore[method-assign]
+    history = trained(whole).history
+    np.testing.assert_allclose(trained(cut).history["total"], history["total"], rtol=1e-5)
+    np.testing.assert_allclose(weights(cut), weights(whole), rtol=1e-5)
+
+
+def test_a_batch_is_never_cut_into_more_pieces_than_samples() -> None:
+    assert pieces(64, 1000) == 1
+    assert pieces(64, 100_000) == 13
+    assert pieces(4, 10_000_000) == 4
 
 
 @pytest.mark.parametrize(("clip", "step"), [(0.0, 11.0), (2.0, 2.0), (20.0, 11.0)])
