@@ -26,6 +26,7 @@ from surrogates.surrogate import Surrogate
 from surrogates.training import train
 from surrogates.training.by_folds import FoldTrainer, chooses_by_folds
 from surrogates.training.loop import Objective
+from surrogates.uncertainty import FEWEST_BY_FOLDS
 
 RUNS = 7
 # x -> 1 - x on the plate's grid, node by node.
@@ -207,6 +208,15 @@ def test_errors_and_band_come_from_left_out_runs_and_not_from_what_was_fitted(tr
     fitted = surrogate.predict(trainer.original.parameters)
     assert np.linalg.norm(fitted - truth, axis=-1).mean() < 0.7 * np.mean(left)
     assert surrogate.bands[2, False].runs == 9
+
+
+@pytest.mark.parametrize("runs", [FEWEST_BY_FOLDS - 1, FEWEST_BY_FOLDS])
+def test_too_few_runs_give_errors_and_no_band_and_say_so(trained, runs: int) -> None:  # type: ignore[no-untyped-def]
+    surrogate, _ = trained(*OF_POD, runs=runs)
+    said = f"there is no band: it takes {FEWEST_BY_FOLDS} training runs, and there are {runs}"
+    assert (said in surrogate.record.notes) == (runs < FEWEST_BY_FOLDS)
+    assert bool(surrogate.bands) == (runs >= FEWEST_BY_FOLDS)
+    assert surrogate.record.errors["MH2"] > 0
 
 
 def test_encoded_runs_carry_what_decoding_loses_and_how_far_latent_numbers_move_nodes(trained) -> None:  # type: ignore[no-untyped-def]
