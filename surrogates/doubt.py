@@ -107,7 +107,7 @@ class BandDoubt:
     ) -> None:
         band = surrogate.bands[level, level > 0]
         beliefs = surrogate.beliefs(parameters)
-        self._run = beliefs.spread(band.spread, band.local) / band.unit
+        self._run = band.of_runs(beliefs)
         self._state = np.interp(time, band.time, band.state)
         self._node = band.node
         rng = np.random.default_rng(seed)

@@ -114,6 +114,10 @@ class Band:
     unit: float = 1.0
     local: LocalErrors | None = None
 
+    def of_runs(self, beliefs: Beliefs) -> NDArray[np.float64]:
+        """(run,): the width for each run against that for a typical one."""
+        return np.asarray(beliefs.spread(self.spread, self.local) / self.unit)
+
     def half_width(
         self, coverage: float, time: NDArray[np.float64], beliefs: Beliefs | None = None
     ) -> NDArray[np.float32]:
@@ -130,7 +134,7 @@ class Band:
             raise SurrogateError(f"coverage {coverage} was asked for; expected {SHARES[0]:g} to {SHARES[-1]:g}")
         factor = np.interp(coverage, SHARES, self.factor)
         if beliefs is not None:
-            factor = factor * float(beliefs.spread(self.spread, self.local)[0]) / self.unit
+            factor = factor * float(self.of_runs(beliefs)[0])
         state = np.interp(time, self.time, self.state)
         return (factor * state[:, None] * self.node[None]).astype(np.float32)
 

@@ -77,7 +77,7 @@ class AtPoints:
         band = self._band()
         if band is None:
             return np.ones(len(parameters))
-        return np.asarray(self.surrogate.beliefs(parameters).spread(band.spread) / band.unit)
+        return band.of_runs(self.surrogate.beliefs(parameters))
 
     def _band(self) -> Band | None:
         return self.surrogate.bands.get((self.level, self.level > 0))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from copy import copy
+from dataclasses import replace
+
 import numpy as np
 import plate
 import pytest
@@ -14,6 +17,7 @@ from surrogates.queries.posterior import posterior
 from surrogates.settings import settings
 from surrogates.surrogate import Surrogate
 from surrogates.training.train import train_surrogate
+from surrogates.uncertainty import Spread
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +57,17 @@ def test_a_model_without_a_band_has_no_deviation(process: Surrogate) -> None:
     known = AtPoints(process, WHERE, np.array([0.03])).deviation()
     assert known is not None
     assert (known > 0).all()
+
+
+@pytest.mark.parametrize("spread", ["constant", "size", "deviation", "local"])
+def test_the_error_of_a_run_goes_with_the_width_of_its_band(process: Surrogate, spread: Spread) -> None:
+    surrogate = copy(process)
+    band = replace(process.bands[0, False], spread=spread, unit=2.0, local=process.local_errors())
+    surrogate.bands = {(0, False): band}
+    mu = plate.parameters(4, seed=3)
+    found = AtPoints(surrogate, WHERE, plate.TIME).spread(mu)
+    widths = [surrogate.band(0.9, parameters=one).mean() / surrogate.band(0.9).mean() for one in mu]
+    np.testing.assert_allclose(found, widths, rtol=1e-5)
 
 
 class Bells:
