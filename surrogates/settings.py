@@ -302,6 +302,10 @@ class Settings(_Frozen):
     missing
         Nodes without a displacement: `hold` the last displacement of each; `refuse` such runs; `auto`: hold if
         elements erode, else refuse.
+    targets
+        What is learnt: `displacement`, and results on elements such as `plastic_strain` beside it.
+    removal
+        Where elements erode, also how likely each is gone (`auto`), or not (`off`).
     """
 
     model: ModelName = "mh"
@@ -319,9 +323,16 @@ class Settings(_Frozen):
     pod: PodSettings = PodSettings()
     precision: Literal["float32", "tf32", "bfloat16"] = "float32"
     missing: Literal["auto", "hold", "refuse"] = "auto"
+    targets: tuple[str, ...] = ("displacement",)
+    removal: Literal["auto", "off"] = "auto"
 
     @model_validator(mode="after")
     def _fits_together(self) -> Settings:
+        if "displacement" not in self.targets:
+            raise ValueError(
+                f"targets {', '.join(self.targets) or 'none'} lacks displacement, which everything else stands beside; "
+                f"expected such as displacement,plastic_strain"
+            )
         if len(set(self.levels)) != len(self.levels):
             raise ValueError(f"levels {list(self.levels)} names a level twice")
         if list(self.levels) != sorted(self.levels, reverse=True):
@@ -375,6 +386,7 @@ _FAST: dict[str, Any] = {
     "transfer": {"upsampling": "sparse", "mlp": "residual", "epochs": 0.2},
 }
 _PAPER: dict[str, Any] = {
+    "removal": "off",
     "validation": {"measure": "paper"},
     "inputs": {"derived": "off"},
     "physics": {"clock": "off", "symmetry": "off"},

@@ -17,7 +17,9 @@ from surrogates.data.inputs import over_range
 from surrogates.errors import SurrogateError
 from surrogates.local_errors import HARD, LocalErrors
 from surrogates.models.base import Network
+from surrogates.models.element_field import ElementField, faces_to_level
 from surrogates.models.pod_regression import PodRegression
+from surrogates.models.removal import Removal
 from surrogates.operators.convolutions import exportable
 from surrogates.physics.registration import Registration
 from surrogates.record import Fit, Record
@@ -53,6 +55,10 @@ class Surrogate:
         The full mesh (node, 3), m, and (face, corner), where the training data told them.
     labels
         The solver's numbers and names on it, where the training data told them.
+    removal
+        How likely elements are gone; None where none was ever removed.
+    fields
+        Results on elements that were learnt beside the displacements, by name.
     """
 
     def __init__(
@@ -70,6 +76,8 @@ class Surrogate:
         self.labels: Labels | None = None
         self.registration = registration or Registration.identity(record.ranges.names, record.time)
         self.bands: dict[tuple[int, bool], Band] = {}
+        self.removal: Removal | None = None
+        self.fields: dict[str, ElementField] = {}
         self._upward: dict[int, sparse.csr_matrix] = {}
 
     @property
@@ -135,6 +143,51 @@ class Surrogate:
         if level not in self._upward:
             self._upward[level] = self.graphs.to_full(level).astype(np.float32)
         return torch.from_numpy(lift(self._upward[level], states.transpose(0, 1).numpy()))
+
+    def predict_removal(self, parameters: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float32]:
+        """Probability that an element of the full mesh is gone: (state, face), or (batch, state, face), as `predict`.
+
+        Raises
+        ------
+        SurrogateError
+            Where the model was trained on runs that lose no element.
+        """
+        if self.removal is None or self.faces is None:
+            raise SurrogateError("the model says nothing of removed elements: its training runs lost none")
+        values, times = self.checked(parameters, time)
+        out = self.removal.probability(self.registration, values, times, len(self.faces))
+        return out[0] if np.ndim(parameters) == 1 else out
+
+    def predict_field(
+        self, name: str, parameters: ArrayLike, time: ArrayLike | None = None, level: int = 0
+    ) -> NDArray[np.float32]:
+        """A result on the elements of `level`: (state, face), or (batch, state, face), as `predict`.
+
+        On a coarse level, each face has the mean of the elements that lie nearest to it.
+
+        Raises
+        ------
+        SurrogateError
+            For a name that was no target of the training.
+        """
+        if name not in self.fields:
+            has = ", ".join(self.fields) or "none"
+            raise SurrogateError(f"{name} was not learnt, of results on elements there is {has}; train with --targets")
+        values, times = self.checked(parameters, time)
+        out = self.fields[name].predict(self.registration, values, times)
+        if level:
+            out = self.on_level(out, level)
+        return out[0] if np.ndim(parameters) == 1 else out
+
+    def on_level(self, values: NDArray[np.float32], level: int) -> NDArray[np.float32]:
+        """(..., face of the full mesh) -> (..., face of `level`)"""
+        if self.points is None or self.faces is None:
+            raise SurrogateError("the model was stored without its mesh; train it again from a dataset")
+        part = None if self.labels is None else self.labels.face_part
+        to_level = faces_to_level(self.points, self.faces, self.graphs[level], part)
+        return np.asarray(
+            (to_level @ values.reshape(-1, values.shape[-1]).T).T.reshape(*values.shape[:-1], -1), np.float32
+        )
 
     def reconstruct(self, states: ArrayLike, level: int | None = None) -> NDArray[np.float32]:
         """Encode and decode displacements (state, node of `level`, 3), m: what the reduction alone costs."""

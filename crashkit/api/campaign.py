@@ -53,6 +53,21 @@ class LevelField:
         return values
 
 
+class ElementValues:
+    """A variable on the faces (sim, state, face) of chosen runs; a run is read when it is asked for."""
+
+    def __init__(self, source: Source, name: str, runs: Sequence[int], shape: tuple[int, int]) -> None:
+        self._source, self._variable, self._runs = source, name, list(runs)
+        self.shape = (len(self._runs), *shape)
+
+    def __getitem__(self, run: int) -> NDArray[Any]:
+        from crashkit.dataset import reading_dataset
+
+        with self._source.opened() as dataset, reading_dataset(self._source.name):
+            values: NDArray[Any] = dataset[self._variable].isel(sim=self._runs[run]).values
+        return values
+
+
 def open_campaign(
     source: Source, test: WhichRuns | None = None, *, symmetry: bool = False, odd: Sequence[str] = ()
 ) -> Campaign:
@@ -76,9 +91,15 @@ def open_campaign(
     from crashkit.selection import runs_of
     from data_schema import fields, parameters, table_unit
     from data_schema.dimensions import dimension
-    from surrogates.data.campaign import Campaign
+    from surrogates.data.campaign import Campaign, ElementTarget
 
     with source.opened() as opened, reading_dataset(source.name):
+        on_faces = [
+            (n, str(opened[n].attrs.get("units", "")))
+            for n in fields(opened)
+            if opened[n].dims == ("sim", "time", "face")
+        ]
+        loses_faces = "alive" in opened
         erodes = "alive" in opened or "cell_alive" in opened
         unread = [n for n in ("displacement", "alive", "cell_alive", "history") if n in opened]
         dataset = opened.drop_vars([*unread, *fields(opened)]).load()
@@ -106,6 +127,8 @@ def open_campaign(
         kept = levels[level - 1].kept
         return np.stack([field[run][:, kept] for run in range(len(chosen))])
 
+    marks = [str(note) for note in dataset["quality_note"].values] if "quality_note" in dataset else [""] * len(runs)
+    per_element = (states, dataset.sizes["face"])
     values = np.stack([dataset[n].values[chosen].astype(np.float64) for n in names], axis=1)
     two_sided = bool(((values.min(axis=0) < 0) & (values.max(axis=0) > 0)).any())
     return Campaign(
@@ -122,6 +145,11 @@ def open_campaign(
         attributes={"dataset": Path(source.name).name, "solver": str(dataset.attrs.get("solver", ""))},
         held_out=tuple(runs[k] for k in held_out),
         erodes=erodes,
+        marked={runs[k]: note for k in chosen if (note := marks[k])},
+        alive=ElementValues(source, "alive", chosen, per_element) if loses_faces else None,
+        targets=tuple(
+            ElementTarget(name, unit, ElementValues(source, name, chosen, per_element)) for name, unit in on_faces
+        ),
         points=np.asarray((at.isel(sim=0) if "sim" in at.dims else at).values, np.float64),
         faces=dataset["face_nodes"].values.astype(np.int32),
         labels=labels_of(dataset),

@@ -239,6 +239,8 @@ def describe_training(surrogate: Surrogate, output: Path) -> dict[str, Any]:
         "validation_errors_m": record.errors, "training_runs": record.fitted_runs,
         "validation_runs": record.validation_runs, "held_out_runs": record.held_out_runs,
         "physics": record.physics, "notes": record.notes,
+        "removal": None if surrogate.removal is None else {k: vars(v) for k, v in surrogate.removal.scores.items()},
+        "fields": {name: known.errors for name, known in surrogate.fields.items()},
     }  # fmt: skip
 
 
@@ -274,6 +276,26 @@ def what_was_chosen(record: Record) -> list[str]:
         several = any("(" in piece for piece in pieces)  # one line for each level
         out += [f"chosen {by}: {line}" for line in (pieces if several else [", ".join(pieces)])]
     return out
+
+
+def what_is_said_of_elements(surrogate: Surrogate) -> list[str]:
+    """How well removal, and results on elements, are told of runs that were left out: a line each."""
+    out = []
+    removal = surrogate.removal
+    if removal is not None and removal.scores:
+        told = "; ".join(
+            f"{name} {_share(score.precision)} and {_share(score.recall)}" for name, score in removal.scores.items()
+        )
+        out.append(f"removal ({' and '.join(removal.terms)}), precision and recall in cross-validation: {told}")
+    for name, known in surrogate.fields.items():
+        unit = "" if known.unit in ("1", "") else f" {known.unit}"
+        told = ", ".join(f"{what} {error:.3g}{unit}" for what, error in known.errors.items())
+        out += [f"{name}, mean absolute error in cross-validation: {told}"] if told else []
+    return out
+
+
+def _share(value: float) -> str:
+    return "-" if value != value else f"{value:.2f}"
 
 
 def middle(surrogate: Surrogate) -> dict[str, str]:

@@ -101,10 +101,11 @@ class Model:
         -------
         xarray.Dataset
             `displacement` (time, node, xyz), m, with `sim` in front for several runs; the parameters; and the mesh, so
-            that `prediction.crash.to_pyvista(time=0.02).plot()` draws it. The coordinate `node` says which node of
-            the full mesh each one is. Attributes: `model`, `level`, and `warnings`: what lies outside the trained
-            range or near a fold, where neighbouring runs differ by more than their distance explains, one
-            per line. Each is a Python warning, too.
+            that `prediction.crash.to_pyvista(time=0.02).plot()` draws it. Also the results on elements (time, face) that
+            were among the targets, and on the full mesh `removal_probability` (time, face) where training runs lost
+            elements. The coordinate `node` says which node of the full mesh each one is. Attributes: `model`, `level`,
+            and `warnings`: what lies outside the trained range or near a fold, where neighbouring runs differ by more
+            than their distance explains, one per line. Each is a Python warning, too.
 
         Raises
         ------
@@ -153,8 +154,10 @@ class Model:
                 slope = np.ascontiguousarray(slopes[..., k])
                 slope = surrogate.lift(slope, number) if full else slope
                 arrays[f"displacement_by_{name}"] = (slope[None], f"m ({unit})-1")
+        on_elements = self._on_elements(values, at, 0 if full else number)
         out = xr.Dataset(
             {
+                **on_elements,
                 **{
                     name: (("sim", "time", "node", "xyz")[: array.ndim], array, {"units": unit, **_role(name)})
                     for name, (array, unit) in arrays.items()
@@ -180,6 +183,21 @@ class Model:
         if not several:
             return out.isel(sim=0)
         return out.assign_coords(sim=[f"prediction_{k}" for k in range(len(values))])
+
+    def _on_elements(self, values: NDArray[np.float64], time: NDArray[np.float64], level: int) -> dict[str, Any]:
+        """What is said of elements, as variables (sim, time, face) of the mesh of `level`."""
+        surrogate = self.surrogate
+        if surrogate.faces is None:
+            return {}
+        dims = ("sim", "time", "face")
+        out: dict[str, Any] = {
+            name: (dims, surrogate.predict_field(name, values, time, level), {"units": known.unit, "role": "field"})
+            for name, known in surrogate.fields.items()
+        }
+        if surrogate.removal is not None and not level:
+            said = surrogate.predict_removal(values, time)
+            out["removal_probability"] = (dims, said, {"units": "1", "role": "field"})
+        return out
 
     def encode(self, states: xr.Dataset | xr.DataArray | ArrayLike, level: int | None = None) -> xr.DataArray:
         """Latent vectors of displacements.

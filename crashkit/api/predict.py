@@ -111,10 +111,23 @@ def beside_truth(prediction: xr.Dataset, truth: xr.Dataset) -> xr.Dataset:
     )
     if level:
         return out
+    both = [n for n in fields(truth) if n in out and out[n].dims == truth[n].dims]
+    out = out.rename({n: f"predicted_{n}" for n in both})
     more = {n: truth[n].variable for n in fields(truth) if truth[n].dims[1] in ("node", "face") and n not in out}
     if "alive" in truth:
         more["alive"] = truth["alive"].variable
     return out.assign(more)
+
+
+def hidden_above(prediction: xr.Dataset, share: float) -> xr.Dataset:
+    """`prediction` with `alive`: False where the probability that an element is gone is above `share`.
+
+    Where it is beside its truth, `alive` stays that of the truth; without `removal_probability` nothing changes.
+    """
+    if "removal_probability" not in prediction or "alive" in prediction:
+        return prediction
+    probability = prediction["removal_probability"]
+    return prediction.assign(alive=(probability.dims, probability.values <= share))
 
 
 def write_prediction(prediction: xr.Dataset, output: str | Path, about: Mapping[str, str] | None = None) -> list[Path]:

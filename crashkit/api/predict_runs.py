@@ -71,6 +71,9 @@ class PredictedRun:
         The mean error over the mean true displacement.
     band
         Of the band that was asked for, if one was.
+    expected_removed, hidden
+        Elements that are gone in the last state: the sum of their probabilities, and how many are hidden; None where
+        nothing is said of them.
     """
 
     run: str
@@ -86,6 +89,8 @@ class PredictedRun:
     largest_error_m: float | None = None
     relative_error: float | None = None
     band: PredictedBand | None = None
+    expected_removed: float | None = None
+    hidden: int | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """As plain values, without those that are None."""
@@ -116,6 +121,7 @@ def predict_runs(
     extrapolate: bool = False,
     band: float | None = None,
     sensitivity: bool = False,
+    hide_above: float = 0.5,
     report: Progress = silent,
 ) -> list[PredictedRun]:
     """Predict runs and write them. Give one of `parameters`, `table` and `run`.
@@ -135,6 +141,8 @@ def predict_runs(
         A run of this dataset, by name or place: it is written with the truth beside it and the error.
     time, level, full, extrapolate, band, sensitivity
         As for `crashkit.Model.predict`. By default a known run is predicted at its own times.
+    hide_above
+        Elements that are gone with more than this probability are hidden in ParaView files, where no truth says more.
     report
         Called with (what, 0, 0, "") before each run.
 
@@ -147,7 +155,7 @@ def predict_runs(
     OutputError
         Where `output` cannot be written.
     """
-    from crashkit.api.predict import beside_truth, model_in_hand, write_prediction
+    from crashkit.api.predict import beside_truth, hidden_above, model_in_hand, write_prediction
 
     asked = model_in_hand(model)
     rows = []
@@ -162,9 +170,10 @@ def predict_runs(
             )  # fmt: skip
         if truth is not None:
             prediction = beside_truth(prediction, truth)
+        prediction = hidden_above(prediction, hide_above)
         about = {"model_name": f"{prediction.attrs['model']} of {asked.name}"}
         files = write_prediction(prediction, wanted.output, about | ({"run": wanted.run} if wanted.run else {}))
-        row = _predicted(wanted, prediction, files, asked.record)
+        row = _predicted(wanted, prediction, files, asked.record, hide_above)
         rows.append(row if band is None else replace(row, band=_band(prediction, band, asked)))
     return rows
 
@@ -245,7 +254,9 @@ def _known(record: Record, output: Path, run: str | int, dataset: Path) -> _Want
     return _Wanted(str(truth["sim"].values), {n: float(truth[n]) for n in record.ranges.names}, output, truth)
 
 
-def _predicted(wanted: _Wanted, prediction: xr.Dataset, files: list[Path], record: Record) -> PredictedRun:
+def _predicted(
+    wanted: _Wanted, prediction: xr.Dataset, files: list[Path], record: Record, hide_above: float
+) -> PredictedRun:
     import numpy as np
 
     known = wanted.truth is not None
@@ -263,6 +274,7 @@ def _predicted(wanted: _Wanted, prediction: xr.Dataset, files: list[Path], recor
             "largest_error_m": float(np.nanmax(error)),
             "relative_error": float(np.nanmean(error) / max(float(np.nanmean(motion)), 1e-12)),
         }
+    last = prediction["removal_probability"].values[-1] if "removal_probability" in prediction else None
     return PredictedRun(
         run=wanted.run,
         files=files,
@@ -273,5 +285,7 @@ def _predicted(wanted: _Wanted, prediction: xr.Dataset, files: list[Path], recor
         nodes=prediction.sizes["node"],
         largest_displacement_m=float(np.linalg.norm(moved, axis=-1).max()),
         warnings=sentences,
+        expected_removed=None if last is None else float(last.sum()),
+        hidden=None if last is None else int((last > hide_above).sum()),
         **errors,
     )

@@ -63,6 +63,12 @@ def command(
     extrapolate: Annotated[
         bool, typer.Option("--extrapolate", help="Predict even far outside the trained range.")
     ] = False,
+    hide_above: Annotated[
+        float,
+        typer.Option(
+            help="Hide elements that are gone with more than this probability (ParaView files).", min=0, max=1
+        ),
+    ] = 0.5,
     json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Predict runs and write them for ParaView or as arrays."""
@@ -78,7 +84,7 @@ def command(
         rows = predict_runs(
             model, output, parameters=asked, table=params, run=run or None,
             dataset=dataset, time=times, level=level, full=full or None, extrapolate=extrapolate, band=band,
-            sensitivity=sensitivity, report=shown.step,
+            sensitivity=sensitivity, hide_above=hide_above, report=shown.step,
         )  # fmt: skip
     if json:
         documents = [row.as_dict() for row in rows]
@@ -102,6 +108,10 @@ def show(rows: list[PredictedRun]) -> None:
         )
     else:
         say(f"{first.files[0]}: {where}, largest displacement {100 * first.largest_displacement_m:.1f} cm")
+    if len(rows) == 1 and first.expected_removed is not None:
+        say(
+            f"elements gone at the end: {first.expected_removed:.0f} expected, {first.hidden} likely enough to be hidden"
+        )
     if first.mean_error_m is not None and first.relative_error is not None and first.largest_error_m is not None:
         say(
             f"error: mean {100 * first.mean_error_m:.2f} cm, {100 * first.relative_error:.1f} % of the motion, "

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from crashkit.api.describe import describe_training, middle, trained_levels, what_was_chosen
+from crashkit.api.describe import describe_training, middle, trained_levels, what_is_said_of_elements, what_was_chosen
 from crashkit.api.train import interrupted, left_behind, train
 from crashkit.cli._console import fixed, print_json, say, table, what_next
 from crashkit.cli._progress import Progress
@@ -40,6 +40,10 @@ def command(
             help="Parameters that change their sign in the mirror, such as impact_angle.", show_default="tried in turn"
         ),
     ] = "",
+    targets: Annotated[
+        str,
+        typer.Option(help="What is learnt, such as displacement,plastic_strain: also results on elements."),
+    ] = "displacement",
     epochs: Annotated[
         int | None, typer.Option(help="Epochs of every level.", min=1, show_default="from the settings")
     ] = None,
@@ -55,6 +59,8 @@ def command(
     given = list(settings or ())
     if odd:
         given.append(f"physics.odd=[{odd}]")
+    if targets != "displacement":
+        given.append(f"targets=[{targets}]")
     if not json:
         for left in left_behind(output, resume=resume):
             say(f"note: {left}")
@@ -110,5 +116,5 @@ def show(surrogate: Surrogate, output: Path) -> None:
             for r in trained_levels(surrogate)
         ),
     )  # fmt: skip
-    for line in what_was_chosen(record):
+    for line in [*what_was_chosen(record), *what_is_said_of_elements(surrogate)]:
         say(line)

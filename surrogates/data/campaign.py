@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,24 @@ class RunByRun(Protocol):
     @property
     def shape(self) -> tuple[int, ...]: ...
 
-    def __getitem__(self, run: int, /) -> NDArray[np.float32]: ...
+    def __getitem__(self, run: int, /) -> NDArray[Any]: ...
+
+
+@dataclass(frozen=True)
+class ElementTarget:
+    """A result on elements that is learnt beside the displacements.
+
+    Attributes
+    ----------
+    values
+        (sim, state, face), taken run by run; NaN where the solver wrote none.
+    unit
+        Of its numbers, such as 1 or Pa.
+    """
+
+    name: str
+    unit: str
+    values: RunByRun
 
 
 @dataclass(frozen=True)
@@ -73,6 +90,12 @@ class Campaign:
         Planes of symmetry of the structure, the best first.
     erodes
         Whether elements disappear, so that displacements of nodes that nothing holds are missing.
+    marked
+        Run -> what of it was beyond a limit when it was ingested.
+    alive
+        (sim, state, face) whether an element is still there, taken run by run; None where none disappears.
+    targets
+        Results on elements that are learnt beside the displacements.
     known
         (sim, state) whether a run was computed that far; None: all were. Other states are in no loss.
     """
@@ -97,3 +120,6 @@ class Campaign:
     mirrors: tuple[MirrorPlane, ...] = ()
     known: NDArray[np.bool_] | None = None
     erodes: bool = False
+    marked: Mapping[str, str] | None = None
+    alive: RunByRun | None = None
+    targets: tuple[ElementTarget, ...] = ()

@@ -58,6 +58,10 @@ def check(campaign: Campaign, settings: Settings, notes: Notes) -> None:
         raise SurrogateError("time must be strictly increasing; crashkit validate names the states that are not")
     if settings.model == "mh" and not campaign.levels:
         raise SurrogateError("the dataset has no mesh hierarchy, which model mh needs; run crashkit coarsen first")
+    if campaign.marked:
+        told = "; ".join(f"{name}: {why}" for name, why in list(campaign.marked.items())[:3])
+        more = f" and {len(campaign.marked) - 3} more" if len(campaign.marked) > 3 else ""
+        notes.add(f"trained on {len(campaign.marked)} runs that ingest marked ({told}{more})")
     ranges = Ranges.of(names, campaign.parameter_units, campaign.parameters, campaign.time)
     for name in ranges.constant:
         if runs > 1:

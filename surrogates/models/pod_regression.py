@@ -24,7 +24,8 @@ from surrogates.data.samples import Notes, scale_of
 from surrogates.errors import SurrogateError
 from surrogates.physics.choice import Worth, choose, not_used
 from surrogates.physics.registration import Registration
-from surrogates.physics.trials import Courses, Folds, Machine, Trials, courses_of, one_thread
+from surrogates.physics.trials import Courses, Folds, Trials, courses_of, one_thread
+from surrogates.physics.weigher import Machine
 from surrogates.regression.gaussian import Gaussian, RadialBasis
 from surrogates.settings import Settings
 
@@ -172,7 +173,8 @@ class PodChoice:
 class PodFit:
     """A fitted POD regression of the registered campaign, and how it was chosen.
 
-    held  calls back with each training run and what the model made without it says of it
+    trials  what everything was chosen with
+    held    calls back with each training run and what the model made without it says of it
     """
 
     core: PodRegression
@@ -180,6 +182,7 @@ class PodFit:
     choice: PodChoice
     worth: Worth
     held: Callable[[], Iterator[Held]]
+    trials: Trials
 
 
 @dataclass(frozen=True)
@@ -208,7 +211,7 @@ def fit_pod_regression(
     with one_thread():
         best, core, choice, worth = _chosen(campaign, settings, chosen, trials, notes)
     core.modes = np.ascontiguousarray(courses.modes @ core.modes)
-    return PodFit(core, best.registration, choice, worth, lambda: _held(best, trials, settings, choice.modes))
+    return PodFit(core, best.registration, choice, worth, lambda: _held(best, trials, settings, choice.modes), trials)
 
 
 def _chosen(

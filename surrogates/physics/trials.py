@@ -24,6 +24,7 @@ from surrogates.errors import SurrogateError
 from surrogates.physics.clock import between
 from surrogates.physics.registration import Registration
 from surrogates.physics.symmetry import mirrored
+from surrogates.physics.weigher import Machine, Weigher
 from surrogates.regression.gaussian import Gaussian, Kernel, RadialBasis
 from surrogates.settings import Settings
 
@@ -213,25 +214,39 @@ class Trials:
         self, registration: Registration, plane: int = 0
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float64]]]:
         """As `predicted`, and the deviation (run,) that the process believes to have, up to a factor."""
-        inputs, values = self.inputs(registration), self.values(registration, plane)
+        values = self.values(registration, plane)
+        for held, part, weigher, inputs in self.weighers(registration, plane):
+            flat = values[part].reshape(len(part), -1)
+
+            def course(
+                x: NDArray[np.float64], time: NDArray[np.float64], weigher: Weigher = weigher,
+                flat: NDArray[np.float32] = flat,
+            ) -> NDArray[np.float32]:  # fmt: skip
+                out = (weigher.weights(x).astype(np.float32) @ flat).reshape(len(x), *values.shape[1:])
+                return _at(out, registration.grid, time)
+
+            said = registration.undo(course, self.parameters[held], self.courses.time).astype(np.float32)
+            yield held, said, weigher.deviation(inputs)
+
+    def weighers(
+        self, registration: Registration, plane: int = 0, values: NDArray[np.float32] | None = None
+    ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], Weigher, NDArray[np.float64]]]:
+        """Of each fold: places of the runs left out, of the runs and images that train, what these weigh, and the inputs
+        (run, input) of those left out.
+
+        Parameters
+        ----------
+        values
+            Courses (run and image, state of the grid, number) to fit to; those of the displacements without.
+        """
+        inputs = self.inputs(registration)
+        values = self.values(registration, plane) if values is None else values
         start = None
         for train, held in self.folds:
             part = self.with_images(registration, train)
             machine = self.fitted(registration, inputs[part], values[part], start)
             start = getattr(machine, "kernel", None)
-            flat = values[part].reshape(len(part), -1)
-
-            def course(
-                x: NDArray[np.float64], time: NDArray[np.float64], machine: Machine = machine,
-                part: NDArray[np.int64] = part, flat: NDArray[np.float32] = flat,
-            ) -> NDArray[np.float32]:  # fmt: skip
-                scaled = over_range(x, inputs[part])
-                out = (machine.weights(scaled).astype(np.float32) @ flat).reshape(len(x), *values.shape[1:])
-                return _at(out, registration.grid, time)
-
-            said = registration.undo(course, self.parameters[held], self.courses.time).astype(np.float32)
-            x = over_range(inputs[held], inputs[part])
-            yield held, said, machine.deviation(x) if isinstance(machine, Gaussian) else np.ones(len(held))
+            yield held, part, Weigher.of(machine, inputs[part]), inputs[held]
 
     def likelihood(self, registration: Registration, plane: int = 0) -> float:
         """Of all training runs, for each sample and output: compares inputs of one clock."""
@@ -282,9 +297,6 @@ class Trials:
         # What is gone has no truth: only living nodes count, and every state the same, as in the report.
         living = c.there[held]
         return np.asarray(((distance * living).sum(axis=2) / np.maximum(living.sum(axis=2), 1)).mean(axis=1))
-
-
-Machine = Gaussian | RadialBasis
 
 
 def course_machine(

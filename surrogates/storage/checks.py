@@ -17,7 +17,9 @@ from surrogates.data.campaign import Labels
 from surrogates.data.graphs import Graphs
 from surrogates.errors import SurrogateError
 from surrogates.models.base import Network
+from surrogates.models.element_field import ElementField
 from surrogates.models.pod_regression import PodRegression
+from surrogates.models.removal import Removal
 from surrogates.record import Record
 from surrogates.uncertainty import SHARES, Band
 
@@ -152,3 +154,20 @@ def check_core(core: Network | PodRegression, graphs: Graphs) -> None:
     for name, tensor in core.state_dict().items():
         if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
             raise SurrogateError(f"weights {name} hold numbers that are not finite")
+
+
+def check_elements(removal: Removal | None, fields: Mapping[str, ElementField], n_faces: int, states: int) -> None:
+    """What is said of elements: places of elements, and as many weights as runs."""
+    if removal is not None:
+        count = len(numbers("faces of the removal", removal.faces, (None,), 0, n_faces))
+        numbers("inputs of the removal", removal.weigher.machine.x, (None, None))
+        if removal.gone_at.shape != (len(removal.weigher.machine.x), count) or np.isnan(removal.gone_at).any():
+            raise SurrogateError(f"gone_at of the removal has the shape {removal.gone_at.shape}, or gaps")
+        numbers("slopes of the removal", removal.slopes, (None,))
+        whole_matrix("neighbours of the removal", removal.around)
+        if set(removal.terms) - {"rate", "nearest", "process"}:
+            raise SurrogateError(f"the removal asks for {', '.join(removal.terms)}")
+    for name, field in fields.items():
+        numbers(f"modes of {name}", field.modes, (n_faces, None))
+        runs = len(numbers(f"inputs of {name}", field.weigher.machine.x, (None, None)))
+        numbers(f"courses of {name}", field.courses, (runs, states, field.modes.shape[1]))

@@ -3,6 +3,7 @@
     model.json             what it is; SHA-256 of every other file, and of itself
     level_3.safetensors .. weights of each level (pod.safetensors for POD regressions)
     graphs.safetensors     the levels' graphs and maps, and the full mesh, so that it lifts and draws without the data
+    elements.safetensors   what is said of elements: their removal, plastic strain and the like; where there is any
     bands.safetensors      how far predictions may be wrong, from the validation runs
     history.json           losses by epoch and level
     card.md                for people
@@ -16,6 +17,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -35,18 +37,29 @@ from surrogates.errors import ModelFolderError, SurrogateError
 from surrogates.local_errors import LocalErrors
 from surrogates.models.base import Network, take_over
 from surrogates.models.cascade import Cascade, build_level
+from surrogates.models.element_field import ElementField
 from surrogates.models.pod_regression import PodRegression
+from surrogates.models.removal import Removal, Score
 from surrogates.models.unified import Unified
 from surrogates.physics.registration import Registration
 from surrogates.record import Record, ranges_as_dict, ranges_from_dict, record_as_dict, record_from_dict
 from surrogates.settings import Settings, parse
 from surrogates.storage.card import card
-from surrogates.storage.checks import check_bands, check_core, check_graphs, check_labels, check_record, plain_files
+from surrogates.storage.checks import (
+    check_bands,
+    check_core,
+    check_elements,
+    check_graphs,
+    check_labels,
+    check_record,
+    plain_files,
+)
 from surrogates.surrogate import Surrogate
 from surrogates.uncertainty import Band, Spread
 
 FORMAT = 2
 _MAIN = "model.json"
+_ELEMENTS = "elements.safetensors"
 _SPREADS: tuple[Spread, ...] = ("constant", "size", "deviation", "local")
 _LABELS = ("node_id", "face_part", "part_id", "face_id")
 
@@ -115,6 +128,9 @@ def load(folder: str | Path) -> Surrogate:
         check_bands(bands, graphs, record)
         check_labels(labels, graphs.n_full, 0 if faces is None else len(faces))
         check_core(core, graphs)
+        tensors = load_file(folder / _ELEMENTS) if _ELEMENTS in files else {}
+        elements = _elements(tensors, about.get("elements", {}))
+        check_elements(*elements, 0 if faces is None else len(faces), len(registration.grid))
         surrogate = Surrogate(settings, record, graphs, core, points, faces, registration)
         for number in core.numbers:  # asked once: sizes that do not fit show here
             surrogate.predict((record.ranges.low + record.ranges.high) / 2, record.time[:1], number)
@@ -125,6 +141,7 @@ def load(folder: str | Path) -> Surrogate:
         raise ModelFolderError(f"{folder}: does not hold together ({said}); train it again") from error
     surrogate.bands = bands
     surrogate.labels = labels
+    surrogate.removal, surrogate.fields = elements
     return surrogate
 
 
@@ -134,6 +151,8 @@ def _write(surrogate: Surrogate, folder: Path) -> None:
         save_file({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, folder / f"{stem}.safetensors")
     save_file(_graph_tensors(surrogate), folder / "graphs.safetensors")
     save_file(_band_tensors(surrogate), folder / "bands.safetensors")
+    if surrogate.removal is not None or surrogate.fields:
+        save_file(_element_tensors(surrogate), folder / _ELEMENTS)
     histories = {str(k): {n: _plain(v) for n, v in f.history.items()} for k, f in record.fits.items()}
     (folder / "history.json").write_text(json.dumps(histories), encoding="utf-8")
     (folder / "card.md").write_text(card(surrogate), encoding="utf-8")
@@ -156,6 +175,7 @@ def _write(surrogate: Surrogate, folder: Path) -> None:
             for name, k in surrogate.level_names.items()
         ],
         "parts": [] if surrogate.labels is None else list(surrogate.labels.part_name),
+        "elements": _plain(_about_elements(surrogate)),
         "files": {path.name: _sha256(path.read_bytes()) for path in sorted(folder.iterdir())},
     }
     about["sha256"] = _sha256(_canonical(about))
@@ -297,6 +317,44 @@ def _bands(tensors: Mapping[str, Tensor], record: Record) -> dict[tuple[int, boo
                 **parts, time=record.time, runs=runs, spread=spread, unit=unit, local=local
             )
     return out
+
+
+def _element_tensors(surrogate: Surrogate) -> dict[str, Tensor]:
+    out = {} if surrogate.removal is None else {f"removal/{k}": v for k, v in surrogate.removal.arrays().items()}
+    for name, known in surrogate.fields.items():
+        out |= {f"field/{name}/{k}": v for k, v in known.arrays().items()}
+    return {k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in out.items()}
+
+
+def _about_elements(surrogate: Surrogate) -> dict[str, Any]:
+    removal = surrogate.removal
+    return {
+        "removal": None
+        if removal is None
+        else {"terms": list(removal.terms), "scores": {k: asdict(v) for k, v in removal.scores.items()}},
+        "fields": {name: {"unit": f.unit, "errors": f.errors} for name, f in surrogate.fields.items()},
+    }
+
+
+def _elements(
+    tensors: Mapping[str, Tensor], about: Mapping[str, Any]
+) -> tuple[Removal | None, dict[str, ElementField]]:
+    def under(prefix: str) -> dict[str, NDArray[Any]]:
+        return {k.removeprefix(prefix): v.numpy() for k, v in tensors.items() if k.startswith(prefix)}
+
+    told = about.get("removal")
+    removal = None
+    if told is not None:
+        scores = {
+            str(k): Score(*(float("nan") if v[n] is None else float(v[n]) for n in ("precision", "recall", "loss")))
+            for k, v in told["scores"].items()
+        }
+        removal = Removal.load(under("removal/"), [str(t) for t in told["terms"]], scores)
+    fields = {
+        str(name): ElementField.load(under(f"field/{name}/"), str(name), str(known["unit"]), known["errors"])
+        for name, known in about.get("fields", {}).items()
+    }
+    return removal, fields
 
 
 def _plain(value: Any) -> Any:

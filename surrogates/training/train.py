@@ -21,6 +21,7 @@ from surrogates.physics.trials import Folds
 from surrogates.record import Fit, Record
 from surrogates.settings import Settings
 from surrogates.surrogate import Surrogate
+from surrogates.training.beside import check_targets, fit_beside
 from surrogates.training.by_folds import FoldTrainer, chooses_by_folds
 from surrogates.training.loop import Diverged, Epoch, Keeper, device_of
 from surrogates.training.refinement import Refined
@@ -64,6 +65,7 @@ def train_surrogate(
     """
     notes = Notes()
     check(campaign, settings, notes)
+    check_targets(campaign, settings)
     of_pod = settings.model in ("pod-gpr", "pod-rbf")
     by_folds = of_pod or chooses_by_folds(settings, campaign)
     parts = everything(campaign, settings) if by_folds else split(campaign, settings, notes)
@@ -86,6 +88,7 @@ def train_surrogate(
         _fit_unified(surrogate, trainer)
     else:
         _fit_cascade(surrogate, trainer)
+    fit_beside(surrogate, campaign, settings, parts.training, notes)
     return surrogate
 
 
@@ -136,6 +139,7 @@ def _fit_regression(surrogate: Surrogate, trainer: Trainer) -> None:
     record.physics = {**found.registration.told(), "errors": found.worth.errors}
     _judge_by_folds(surrogate, trainer, found)
     record.errors |= found.choice.errors
+    fit_beside(surrogate, campaign, trainer.settings, runs, trainer.notes, found.trials)
     record.fits[0] = Fit(seconds=time.perf_counter() - started)
 
 

@@ -45,8 +45,9 @@ def few(bumper: Path) -> xr.Dataset:
 def models(few: xr.Dataset) -> tuple[crashkit.Model, crashkit.Model]:
     """Both kinds of model, as they come: no setting says anything of elements that fail."""
     test = [str(name) for name in few["sim"].values[-2:]]
+    targets = ("displacement", "plastic_strain")
     return (
-        crashkit.train(few, model="pod-gpr", test=test),
+        crashkit.train(few, model="pod-gpr", test=test, settings={"targets": targets}),
         crashkit.train(few, model="mh", test=test, epochs=2),
     )
 
@@ -160,3 +161,90 @@ def test_a_run_beside_its_truth_in_paraview_hides_what_has_failed(
     assert dead.sum() > 10
     np.testing.assert_array_equal(np.asarray(grid.cell_data["vtkGhostType"]) != 0, dead)
     assert np.isfinite(np.asarray(grid.points)).all()
+    assert {"plastic_strain", "predicted_plastic_strain", "removal_probability"} <= set(grid.cell_data)
+
+
+def test_a_prediction_says_how_likely_each_element_is_gone(
+    few: xr.Dataset, models: tuple[crashkit.Model, crashkit.Model]
+) -> None:
+    ever = (~few["alive"].isel(sim=slice(-2))).any(("sim", "time")).values
+    for model in models:
+        assert model.surrogate.removal is not None
+        scores = model.surrogate.removal.scores
+        assert scores["chosen"].loss < scores["rate of the element"].loss
+        values = {name: float(few[name][-1]) for name in model.parameters}
+        said = model.predict(values, extrapolate=True)["removal_probability"]
+        assert said.dims == ("time", "face")
+        assert float(said.min()) >= 0
+        assert 0.2 < float(said.max()) <= 1
+        assert (np.diff(said.values, axis=0) >= 0).all()
+        assert not said.values[:, ~ever & ~_mirrored(few, ever)].any()
+        dead = ~few["alive"].isel(sim=-1).values
+        assert said.values[dead].mean() > 10 * said.values[~dead].mean()
+
+
+def _mirrored(few: xr.Dataset, faces: np.ndarray) -> np.ndarray:
+    """Whether a face is the image at y = 0 of one of `faces` (face,)."""
+    corners = few["face_nodes"].values
+    at = np.where((corners >= 0)[..., None], few["reference_position"].values[corners], np.nan)
+    centre = np.nanmean(at, axis=1)
+    image = np.array([np.linalg.norm(centre - one, axis=1).argmin() for one in centre * [1, -1, 1]])
+    return faces[image]
+
+
+def test_elements_that_are_likely_gone_are_hidden(
+    few: xr.Dataset, models: tuple[crashkit.Model, crashkit.Model], tmp_path: Path
+) -> None:
+    models[0].save(tmp_path / "gpr")
+    values = [
+        x for name in models[0].parameters for x in ("--param", f"{name}={float(few[name][-1])!r}{_unit(few, name)}")
+    ]
+    hidden = {}
+    for share in ("0.1", "0.5", "1"):
+        arguments = ["predict", str(tmp_path / "gpr"), *values, "-o", str(tmp_path / "new.pvd"), "--extrapolate"]
+        told = CliRunner().invoke(app, [*arguments, "--hide-above", share])
+        assert told.exit_code == 0, told.output
+        assert "elements gone at the end" in told.output
+        _, grid = read_state(tmp_path / "new.pvd")
+        ghost, said = np.asarray(grid.cell_data["vtkGhostType"]) != 0, np.asarray(grid.cell_data["removal_probability"])
+        np.testing.assert_array_equal(ghost, said > float(share))
+        hidden[share] = ghost.sum()
+    assert hidden["0.1"] > hidden["0.5"] >= hidden["1"] == 0
+
+
+def _unit(few: xr.Dataset, name: str) -> str:
+    return "" if few[name].attrs["units"] == "1" else few[name].attrs["units"].replace(" ", "*").replace("s-1", "s**-1")
+
+
+def test_plastic_strain_is_learnt_beside_the_displacements(
+    few: xr.Dataset, models: tuple[crashkit.Model, crashkit.Model]
+) -> None:
+    model = models[0]
+    errors = model.surrogate.fields["plastic_strain"].errors
+    assert errors["chosen"] < min(errors["mean of the runs"], errors["nearest run"])
+    one = few.isel(sim=-1).compute()
+    said = model.predict({name: float(one[name]) for name in model.parameters}, extrapolate=True)["plastic_strain"]
+    assert said.attrs["units"] == "1"
+    there = one["alive"].values
+    off = np.abs(said.values - one["plastic_strain"].values)[there].mean()
+    mean = few["plastic_strain"].isel(sim=slice(-2)).mean("sim").values
+    assert off < 0.8 * np.abs(mean - one["plastic_strain"].values)[there].mean()
+    assert float(said.min()) >= 0
+
+
+def test_a_result_on_elements_is_known_on_every_level(
+    bumper: Path, few: xr.Dataset, models: tuple[crashkit.Model, crashkit.Model]
+) -> None:
+    surrogate = models[0].surrogate
+    parameters = np.array([float(few[name][-1]) for name in surrogate.record.ranges.names])
+    for level in crashkit.open_hierarchy(bumper).levels:
+        coarse = surrogate.predict_field("plastic_strain", parameters, level=level.index)
+        fine = surrogate.predict_field("plastic_strain", parameters)
+        assert coarse.shape == (few.sizes["time"], len(level.faces))
+        assert coarse.max() <= fine.max() + 1e-6
+        assert coarse.mean() == pytest.approx(fine.mean(), rel=0.5)
+
+
+def test_a_target_that_is_not_there_is_named(few: xr.Dataset) -> None:
+    with pytest.raises(crashkit.SurrogateError, match=r"temperature.*plastic_strain.*--fields temperature"):
+        crashkit.train(few, model="pod-gpr", settings={"targets": ["displacement", "temperature"]})

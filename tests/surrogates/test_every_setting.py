@@ -112,6 +112,8 @@ TABLE: dict[str, list[Line]] = {
     "pod.inputs": [line("pod.inputs=point", **POD), line("pod.inputs=auto", on=NONE, model="pod-gpr")],  # type: ignore[arg-type]
     "pod.points": [line("pod.points=20", given=("pod.inputs=point",), **POD)],  # type: ignore[arg-type]
     "precision": [line("precision=tf32", on=NONE), line("precision=bfloat16")],
+    "targets": [line("targets=[displacement]", on=NONE)],
+    "removal": [line("removal=off", on=NONE)],
     "missing": [line("missing=hold", on=NONE), line("missing=refuse", on=NONE)],
 }  # fmt: skip
 MU = plate.parameters(2, seed=5)
