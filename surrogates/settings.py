@@ -326,6 +326,11 @@ class Settings(_Frozen):
     targets: tuple[str, ...] = ("displacement",)
     removal: Literal["auto", "off"] = "auto"
 
+    @field_validator("removal", mode="before")
+    @classmethod
+    def _off(cls, value: Any) -> Any:
+        return "off" if value is False else value  # YAML reads off as false
+
     @model_validator(mode="after")
     def _fits_together(self) -> Settings:
         if "displacement" not in self.targets:

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from surrogates.data.campaign import Campaign, Mirror, RunByRun
+from data_schema.mirror import MirrorPlane
+from surrogates.data.campaign import Campaign, RunByRun
 from surrogates.physics.registration import Registration
 from surrogates.physics.trials import Folds, Trials
 from surrogates.physics.weigher import Weigher
@@ -206,6 +207,8 @@ def _choose(
 ) -> None:  # fmt: skip
     """Fit the logistic regression to what folds say of the runs they leave out; choose its terms there."""
     from sklearn.linear_model import LogisticRegression
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
 
     states = np.unique(np.linspace(0, len(campaign.time) - 1, _STATES).astype(int))
     rows: dict[tuple[str, ...], list[NDArray[np.float64]]] = {terms: [] for terms in TERMS}
@@ -233,7 +236,7 @@ def _choose(
         return
 
     def model() -> Any:
-        return LogisticRegression(C=1.0, max_iter=300)
+        return make_pipeline(StandardScaler(), LogisticRegression(C=1.0, max_iter=500))
 
     best = np.inf
     for terms in TERMS:
@@ -251,7 +254,9 @@ def _choose(
             out.scores["chosen"] = score
     out.scores["nearest run"] = _yes_or_no(np.concatenate(nearest), y)
     fitted = model().fit(np.concatenate(rows[out.terms]), y)
-    out.slopes, out.offset = fitted.coef_[0].astype(np.float64), float(fitted.intercept_[0])
+    scaler, logistic = fitted[0], fitted[1]
+    out.slopes = np.asarray(logistic.coef_[0] / scaler.scale_, np.float64)
+    out.offset = float(logistic.intercept_[0] - out.slopes @ scaler.mean_)
 
 
 def judged(probability: NDArray[np.floating], removed: NDArray[np.bool_]) -> Score:
@@ -291,7 +296,7 @@ def centres(points: NDArray[np.float64], faces: NDArray[np.integer]) -> NDArray[
 
 
 def mirrored_faces(
-    mirror: Mirror, points: NDArray[np.float64], faces: NDArray[np.integer], part: NDArray[np.int64] | None
+    mirror: MirrorPlane, points: NDArray[np.float64], faces: NDArray[np.integer], part: NDArray[np.int64] | None
 ) -> NDArray[np.int64]:
     """(face,): the face nearest to each one's mirror image; within the parts where the images of faces lie."""
     from scipy.spatial import cKDTree

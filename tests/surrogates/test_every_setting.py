@@ -18,7 +18,7 @@ from pydantic import BaseModel
 from scipy import sparse
 
 from data_schema.mirror import MirrorPlane
-from surrogates.data.campaign import Campaign
+from surrogates.data.campaign import Campaign, ElementTarget
 from surrogates.errors import SurrogateError
 from surrogates.physics import trials
 from surrogates.settings import Settings, settings
@@ -34,9 +34,9 @@ SMALL = {
         "level.mlp.widths=[8]", "level.mlp.activation=elu", "level.regression=network", "level.schedule=constant",
         "level.weight_decay=0", "level.rate_inputs=0", "level.learning_rate=0.01", "transfer.upsampling=static",
         "transfer.mlp=input", "transfer.epochs=1", "validation.share=0.3", "inputs.derived=off", "physics.clock=off",
-        "physics.symmetry=off",
+        "physics.symmetry=off", "removal=off",
     ),
-    "pod-gpr": ("pod.modes=[3]", "pod.inputs=trajectory", "inputs.derived=off", "physics.clock=off", "physics.symmetry=off"),
+    "pod-gpr": ("pod.modes=[3]", "pod.inputs=trajectory", "inputs.derived=off", "physics.clock=off", "physics.symmetry=off", "removal=off"),
 }  # fmt: skip
 BOTH, FINE, NONE = {2, 1}, {1}, set[int]()
 
@@ -112,8 +112,8 @@ TABLE: dict[str, list[Line]] = {
     "pod.inputs": [line("pod.inputs=point", **POD), line("pod.inputs=auto", on=NONE, model="pod-gpr")],  # type: ignore[arg-type]
     "pod.points": [line("pod.points=20", given=("pod.inputs=point",), **POD)],  # type: ignore[arg-type]
     "precision": [line("precision=tf32", on=NONE), line("precision=bfloat16")],
-    "targets": [line("targets=[displacement]", on=NONE)],
-    "removal": [line("removal=off", on=NONE)],
+    "targets": [line("targets=[displacement, bending]", on=NONE)],
+    "removal": [line("removal=auto", on=NONE)],
     "missing": [line("missing=hold", on=NONE), line("missing=refuse", on=NONE)],
 }  # fmt: skip
 MU = plate.parameters(2, seed=5)
@@ -125,7 +125,12 @@ def campaign() -> Campaign:
         np.array([1.0, 0.0, 0.0]), 0.5, sparse.csr_matrix(np.eye(81)[np.arange(81).reshape(9, 9)[::-1].ravel()])
     )
     speed, stress = (0.0, 1.0, -1.0), (1.0, -1.0, -2.0)
-    return plate.campaign(10, dimensions=(speed, None, stress), mirrors=(mirror,))
+    bending = np.linspace(0, 1, 10 * len(plate.TIME) * 64).reshape(10, len(plate.TIME), 64).astype(np.float32)
+    alive = bending < np.linspace(0.3, 1.1, 64)
+    return plate.campaign(
+        10, dimensions=(speed, None, stress), mirrors=(mirror,), alive=alive,
+        targets=(ElementTarget("bending", "1", bending),),
+    )  # fmt: skip
 
 
 @functools.cache
@@ -184,6 +189,12 @@ def test_a_setting_trains_changes_what_it_should_and_is_stored(name: str, entry:
     assert again.settings == after.settings
     for level, field in predicted(again).items():
         np.testing.assert_array_equal(field, new[level])
+    assert (after.removal is not None) == (name == "removal")
+    assert set(after.fields) == ({"bending"} if name == "targets" else set())
+    for known in after.fields:
+        np.testing.assert_array_equal(again.predict_field(known, MU), after.predict_field(known, MU))
+    if after.removal is not None:
+        np.testing.assert_array_equal(again.predict_removal(MU), after.predict_removal(MU))
 
 
 @pytest.mark.parametrize("preset", ["fast", "paper"])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from surrogates.data.campaign import Mirror
+from data_schema.mirror import MirrorPlane
 from surrogates.models.removal import centres, judged, mirrored_faces, neighbours, removal_times
 
 TIME = np.array([0.0, 1.0, 2.0, 4.0])
@@ -45,7 +45,7 @@ def test_the_image_of_a_face_lies_on_the_other_side_and_in_the_part_that_is_the_
     )
     faces = np.array([[0, 1, 2], [3, 4, 5], [6, 7, 8]])
     to_image = sparse.csr_matrix(np.eye(9)[[3, 4, 5, 0, 1, 2, 3, 4, 5]])
-    mirror = Mirror(np.diag([-1.0, 1, 1]), to_image)
+    mirror = MirrorPlane(np.array([1.0, 0, 0]), 0.0, to_image)
     assert mirrored_faces(mirror, points, faces, np.array([0, 1, 2])).tolist()[:2] == [1, 0]
 
 
