@@ -36,7 +36,7 @@ _SHARE, _COUNT = 0.005, 0.5
 # Rings of neighbours that means are taken over.
 _RINGS = (1, 3)
 # States and rows (element, state, run) that the classifier is fitted to.
-_STATES, _ROWS = 21, 2_000_000
+_STATES, _ROWS = 21, 300_000
 # Fewer runs than this choose nothing.
 _FEWEST = 6
 # An element counts as removed above this probability.
@@ -211,7 +211,7 @@ def _choose(
     from sklearn.preprocessing import StandardScaler
 
     states = np.unique(np.linspace(0, len(campaign.time) - 1, _STATES).astype(int))
-    rows: dict[tuple[str, ...], list[NDArray[np.float64]]] = {terms: [] for terms in TERMS}
+    rows: dict[str, list[NDArray[np.float32]]] = {term: [] for term in TERMS[-1]}
     truth: list[NDArray[np.bool_]] = []
     group: list[NDArray[np.int64]] = []
     nearest: list[NDArray[np.bool_]] = []
@@ -225,13 +225,14 @@ def _choose(
             asked = _Asked(weights[k], int(near[k]), out.gone_at[part], times)
             true = (when[run][None] <= campaign.time[states][:, None]).ravel()
             some = np.sort(draw.permutation(len(true))[:most])
-            for terms in TERMS:
-                found = _features(asked, terms, out.around)
-                rows[terms].append(found.reshape(len(true), -1)[some].astype(np.float32))
+            for term, known in rows.items():
+                found = _features(asked, (term,), out.around)
+                known.append(found.reshape(len(true), -1)[some].astype(np.float32))
             truth.append(true[some])
             group.append(np.full(len(some), fold))
             nearest.append(asked.shares("nearest").ravel()[some] > HALF)
     y, folds = np.concatenate(truth), np.concatenate(group)
+    columns = {term: np.concatenate(known) for term, known in rows.items()}
     if not y.any() or y.all():
         return
 
@@ -240,7 +241,7 @@ def _choose(
 
     best = np.inf
     for terms in TERMS:
-        x = np.concatenate(rows[terms])
+        x = np.concatenate([columns[term] for term in terms], axis=1)
         said = np.full(len(y), y.mean())
         for fold in np.unique(folds):
             others = folds != fold
@@ -253,7 +254,7 @@ def _choose(
             best, out.terms = score.loss, terms
             out.scores["chosen"] = score
     out.scores["nearest run"] = _yes_or_no(np.concatenate(nearest), y)
-    fitted = model().fit(np.concatenate(rows[out.terms]), y)
+    fitted = model().fit(np.concatenate([columns[term] for term in out.terms], axis=1), y)
     scaler, logistic = fitted[0], fitted[1]
     out.slopes = np.asarray(logistic.coef_[0] / scaler.scale_, np.float64)
     out.offset = float(logistic.intercept_[0] - out.slopes @ scaler.mean_)

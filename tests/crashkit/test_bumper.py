@@ -105,7 +105,7 @@ def test_interpolation_errors_come_by_part_and_average_over_its_nodes(bumper: Pa
 
 
 def test_coarsen_prints_them(bumper: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    show(bumper, summarize_hierarchy(bumper))
+    show(bumper, summarize_hierarchy(bumper), "all runs")
     printed = capsys.readouterr().out
     assert "Interpolation error by part" in printed
     assert all(name in printed for name in PARTS)
