@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from crashkit.api.invert import Inversion as Inversion
     from crashkit.api.invert import invert as invert
     from crashkit.api.model import Model as Model
+    from crashkit.api.optimise import Optimum as Optimum
+    from crashkit.api.optimise import optimise as optimise
     from crashkit.api.predict import load_model as load_model
     from crashkit.api.predict import predict as predict
     from crashkit.api.scatter import scatter as scatter
@@ -54,6 +56,7 @@ _LAZY = {
     "Inversion": "crashkit.api.invert",
     "MeshError": "crashkit.errors",
     "Model": "crashkit.api.model",
+    "Optimum": "crashkit.api.optimise",
     "OutputError": "crashkit.errors",
     "ReadError": "crashkit.errors",
     "SurrogateError": "surrogates.errors",
@@ -68,6 +71,7 @@ _LAZY = {
     "load_model": "crashkit.api.predict",
     "open_dataset": "crashkit.dataset",
     "open_hierarchy": "crashkit.mesh.store",
+    "optimise": "crashkit.api.optimise",
     "predict": "crashkit.api.predict",
     "scatter": "crashkit.api.scatter",
     "train": "crashkit.api.train",

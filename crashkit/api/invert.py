@@ -206,7 +206,7 @@ def invert(
     deviation = _length(noise)
     points, values, rows, notes = _placed(surrogate, table, deviation, level)
     low, high = ranges.low.copy(), ranges.high.copy()
-    for name, value in _known(known or {}, surrogate).items():
+    for name, value in known_values(known or {}, surrogate).items():
         low[ranges.names.index(name)] = high[ranges.names.index(name)] = value
     if not (high > low).any():
         raise DataError("all parameters are known; leave at least one to be found")
@@ -260,8 +260,8 @@ def _length(noise: float | str) -> float:
     return value
 
 
-def _known(given: Mapping[str, Any], surrogate: Surrogate) -> dict[str, float]:
-    """Values, in the model's units, of the parameters that are given."""
+def known_values(given: Mapping[str, Any], surrogate: Surrogate) -> dict[str, float]:
+    """Values, in the model's units, of the parameters that are given, by name and with units as for `Model.predict`."""
     from crashkit.api.parameters import parameter_values
 
     ranges = surrogate.record.ranges

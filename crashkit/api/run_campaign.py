@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -58,6 +58,7 @@ def run_campaign(
     most_runs: int | None = None,
     executor: Executor | None = None,
     retry: bool = False,
+    runs: str | Path | None = None,
     report: Progress | None = None,
     say: Say | None = None,
 ) -> CampaignSummary:
@@ -78,6 +79,9 @@ def run_campaign(
         Where runs are computed; default: processes of this machine, or what the file says.
     retry
         Compute failed runs again.
+    runs
+        A table of runs to compute as well, one row per run with the parameters of the campaign, units in the heads: such
+        as `crashkit optimise` and `crashkit propose` write. Runs that are there already are not computed twice.
     report, say
         `report` hears how many runs are decided and which are running; `say` hears a sentence after each step.
 
@@ -118,6 +122,8 @@ def run_campaign(
             campaign.retry()
         if not campaign.table.runs():
             campaign.add(_first_points(campaign), "start")
+        if runs is not None:
+            campaign.add(points_of_table(Path(runs), campaign.plan.names, campaign.plan.units), "asked")
         started = time.monotonic()
         while True:
             _compute(campaign, report)
@@ -226,6 +232,38 @@ def _train_wanted(campaign: Campaign) -> Path | None:
         coarsen(campaign.dataset, nodes=list(plan.nodes))
     train(campaign.dataset, folder, plan.model, settings=[f"{k}={v}" for k, v in plan.settings.items()], overwrite=True)
     return folder
+
+
+def points_of_table(path: Path, names: Sequence[str], units: Sequence[str]) -> NDArray[np.float64]:
+    """(run, parameter) of a table, in `units`; a column `run` with names is left aside.
+
+    Raises
+    ------
+    ReadError, DataError
+        For a table that cannot be read, lacks a parameter, or has it in another kind of unit.
+    """
+    import numpy as np
+
+    from crashkit.errors import DataError
+    from crashkit.ingestion.parameter_table import read_numbers
+    from data_schema import to_si
+
+    table = read_numbers(path, [n.lower() for n in names], aside=("run", "sim", "name"))
+    places = {name: k for k, (name, _) in enumerate(table.columns)}
+    if sorted(places) != sorted(names):
+        other = sorted(set(places) ^ set(names))[0]
+        raise DataError(f"{path}: {other} is in one of table and campaign alone; the campaign has {', '.join(names)}")
+    values = np.array([row for _, row in table.rows], np.float64).reshape(len(table.rows), -1)
+    out = np.empty((len(values), len(names)))
+    for k, (name, unit) in enumerate(zip(names, units, strict=True)):
+        column, stated = values[:, places[name]], table.columns[places[name]][1]
+        if not np.isfinite(column).all():
+            raise DataError(f"{path}: {name} is missing in row {table.rows[int(np.isnan(column).argmax())][0]}")
+        (factor, si), (own, own_si) = to_si(stated or unit), to_si(unit)
+        if si != own_si:
+            raise DataError(f"{path}: {name} is in {stated}; the campaign has it in {unit or 'no unit'}")
+        out[:, k] = column * (factor / own)
+    return out
 
 
 def _first_points(campaign: Campaign) -> NDArray[np.float64]:

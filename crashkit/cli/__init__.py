@@ -30,6 +30,7 @@ COMMANDS = (
     "explore",
     "scatter",
     "invert",
+    "optimise",
     "propose",
     "campaign",
     "export",

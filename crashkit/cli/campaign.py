@@ -30,6 +30,12 @@ def command(
     most_runs: Annotated[
         int | None, typer.Option(help="End at this number of runs.", min=1, show_default=False)
     ] = None,
+    runs: Annotated[
+        Path | None,
+        typer.Option(
+            help="Also compute the runs of this table, such as confirm.csv of crashkit optimise.", show_default=False
+        ),
+    ] = None,
     retry: Annotated[bool, typer.Option("--retry", help="Compute failed runs again.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
@@ -47,7 +53,7 @@ def command(
     with Progress(f"campaign {study}", quiet=json) as shown:
         try:
             summary = run_campaign(
-                study, output, until=until or None, confidence=confidence, most_runs=most_runs, retry=retry,
+                study, output, until=until or None, confidence=confidence, most_runs=most_runs, retry=retry, runs=runs,
                 report=shown.step,
                 say=None if json else say,
             )  # fmt: skip

@@ -189,8 +189,10 @@ class Numbers:
     rows: tuple[tuple[int, tuple[float, ...]], ...]
 
 
-def read_numbers(path: Path, keys: Sequence[str]) -> Numbers:
+def read_numbers(path: Path, keys: Sequence[str], aside: Sequence[str] = ()) -> Numbers:
     """A table of which every column holds numbers, such as measured points; one of `keys` stands in its header.
+
+    Columns called as in `aside` are left out.
 
     Raises
     ------
@@ -198,8 +200,8 @@ def read_numbers(path: Path, keys: Sequence[str]) -> Numbers:
         With the row and column of what cannot be understood.
     """
     table = _load(path, keys)
-    every = range(len(table.header))
-    columns = parameter_columns(table.header, [""] * len(table.header), str(path))
+    every = [k for k, title in enumerate(table.header) if _plain(title) not in aside]
+    columns = parameter_columns([table.header[k] for k in every], [""] * len(every), str(path))
     first = next((k for name in keys for k in _called(table.header, name)), 0)
     body, below = _without_units_row(table, first, [k for k in every if k != first])
     mark = _decimal_mark(body, every, path)
@@ -214,7 +216,8 @@ def read_numbers(path: Path, keys: Sequence[str]) -> Numbers:
         )
         for number, line in body
     ]  # fmt: skip
-    return Numbers(tuple((n, u or below.get(k, "")) for k, (n, u) in enumerate(columns)), tuple(rows))
+    named = tuple((n, u or below.get(k, "")) for k, (n, u) in zip(every, columns, strict=True))
+    return Numbers(named, tuple(rows))
 
 
 def _load(path: Path, keys: Sequence[str]) -> _Table:
