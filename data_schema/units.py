@@ -184,6 +184,31 @@ def to_si(unit: str) -> tuple[float, str]:
     return found
 
 
+_NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
+
+
+def number_and_unit(text: str) -> tuple[float, str] | None:
+    """The number that `text` begins with and what stands behind it, "52km/h" -> (52.0, "km/h"); None without a number."""
+    found = _NUMBER.fullmatch(text)
+    return None if found is None else (float(found[1]), found[2])
+
+
+def length(text: str) -> float:
+    """A length above zero with its unit, such as "8 mm", in m.
+
+    Raises
+    ------
+    UnknownUnits
+        Where it is none; an empty unit is none.
+    """
+    found = number_and_unit(text)
+    factor, label = to_si(found[1]) if found else (0.0, "")
+    value = found[0] * factor if found else 0.0
+    if label != "m" or not 0 < value < float("inf"):
+        raise UnknownUnits(f"{text!r} is no length above zero; expected a number with a unit, such as 8 mm")
+    return value
+
+
 def is_unit(text: str) -> bool:
     """Whether `text` is a unit of mechanics; a lone "min" is not: it says minimum more often than minute."""
     text = " ".join(text.split())

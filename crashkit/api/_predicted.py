@@ -44,7 +44,7 @@ class Structure:
     def nodes(self, number: int) -> NDArray[np.int64]:
         """The place of the solver's node `number`; empty where there is none."""
         labels = self.surrogate.labels
-        numbers = np.arange(self.size) if labels is None else labels.node_id
+        numbers = np.arange(1, self.size + 1) if labels is None else labels.node_id
         return np.asarray(np.flatnonzero(numbers == number))
 
 

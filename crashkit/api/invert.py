@@ -241,23 +241,17 @@ def _read(measured: str | Path | pd.DataFrame) -> MeasuredPoints:
 
 
 def _length(noise: float | str) -> float:
-    import math
-
+    """The standard deviation `noise`, in m; a number alone is in m."""
     from crashkit.errors import DataError
-    from data_schema.units import UnknownUnits, to_si
+    from data_schema.units import UnknownUnits, length, number_and_unit
 
+    text = noise if isinstance(noise, str) else f"{float(noise)!r} m"
+    if (alone := number_and_unit(text)) and not alone[1]:
+        text = f"{alone[0]!r} m"
     try:
-        if isinstance(noise, str):
-            number = noise.strip().rstrip("abcdefghijklmnopqrstuvwxyzµ ")
-            factor, label = to_si(noise.strip()[len(number) :].strip() or "m")
-            value = float(number) * factor
-        else:
-            value, label = float(noise), "m"
-    except (ValueError, UnknownUnits):
-        value, label = math.nan, "m"
-    if not (math.isfinite(value) and value > 0 and label == "m"):
-        raise DataError(f"noise {noise!r}: expected a length above zero, such as 1mm")
-    return value
+        return length(text)
+    except UnknownUnits as error:
+        raise DataError(f"noise: {error}") from error
 
 
 def known_values(given: Mapping[str, Any], surrogate: Surrogate) -> dict[str, float]:
@@ -387,7 +381,7 @@ def _warnings(
             for e in told
         )
         shares = (f"({100 * e.share:.0f} %) {text}" for e, text in zip(told, texts, strict=True))
-        out.append(f"{len(told)} explanations: {'; '.join(shares)}; more or other points may tell them apart")
+        out.append(f"{len(told)} explanations: {'; '.join(shares)}; more or other points may distinguish them")
     for k in found.at_edge().nonzero()[0]:
         edge = found.low[k] if found.best[k] - found.low[k] < found.high[k] - found.best[k] else found.high[k]
         out.append(
@@ -396,7 +390,7 @@ def _warnings(
         )
     wide = [n for n, w in zip(names, found.hardly_told(), strict=True) if w]
     if wide:
-        out.append(f"{', '.join(wide)}: hardly told by these points; nearly the whole range explains them")
+        out.append(f"{', '.join(wide)}: hardly determined by these points; nearly the whole range explains them")
     return out
 
 

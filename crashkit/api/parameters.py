@@ -57,22 +57,23 @@ def _value(name: str, given: float | str, unit: str, written: tuple[str, float])
 
     from crashkit.errors import DataError
     from data_schema import to_si
+    from data_schema.units import number_and_unit
 
     if not isinstance(given, str):
         value = float(given)
     else:
-        found = re.fullmatch(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*", given)
-        if found is None or re.match(r",\s*\d", found[2]):
+        found = number_and_unit(given)
+        if found is None or re.match(r",\s*\d", found[1]):
             comma = "; the decimal sign is a point" if "," in given else ""
             raise DataError(
                 f"{name}={given}: expected a number, with a unit if you like, such as {name}=1{written[0]}{comma}"
             )
-        value = float(found[1])
-        if found[2]:
-            factor, si = to_si(found[2])
+        value, own = found
+        if own:
+            factor, si = to_si(own)
             if si != to_si(unit)[1]:
                 raise DataError(
-                    f"{name}={given}: the unit {found[2]!r} is not one of {name}, which is in {written[0] or 'no unit'}"
+                    f"{name}={given}: the unit {own!r} is not one of {name}, which is in {written[0] or 'no unit'}"
                 )
             value *= factor / to_si(unit)[0]
         else:

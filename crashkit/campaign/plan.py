@@ -154,20 +154,12 @@ class Plan(Box):
 
 def length_of(text: str) -> float:
     """A length with its unit, such as "8 mm", in m. Raises CampaignError."""
-    from data_schema import UnknownUnits, to_si
+    from data_schema.units import UnknownUnits, length
 
-    number, _, unit = text.strip().partition(" ")
     try:
-        if not unit:
-            digits = text.strip().rstrip("abcdefghijklmnopqrstuvwxyz")
-            number, unit = digits, text.strip()[len(digits) :]
-        factor, si = to_si(unit)
-        value = float(number) * factor
-    except (ValueError, UnknownUnits) as error:
-        raise CampaignError(f"{text!r} is no length; expected a number with a unit, such as '8 mm'") from error
-    if si != "m" or not value > 0:
-        raise CampaignError(f"{text!r} is no length above zero; expected such as '8 mm'")
-    return value
+        return length(text)
+    except UnknownUnits as error:
+        raise CampaignError(f"until: {error}") from error
 
 
 def read_plan(path: str | Path) -> Plan:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from data_schema import UnknownUnits, si_unit, to_si, unit_system
-from data_schema.units import _USUAL, _understood, is_unit
+from data_schema.units import _USUAL, _understood, is_unit, length, number_and_unit
 
 
 @pytest.mark.parametrize(
@@ -170,3 +170,20 @@ def test_what_pint_reads_over_is_no_unit(unit: str) -> None:
 def test_a_unit_of_two_meanings_is_refused_with_both(unit: str) -> None:
     with pytest.raises(UnknownUnits, match="may be metres per second or one per millisecond; write m/s"):
         to_si(unit)
+
+
+@pytest.mark.parametrize(("text", "metres"), [("8 mm", 8e-3), ("8mm", 8e-3), ("1e-3 m", 1e-3), (" .5 in ", 0.0127)])
+def test_a_length_is_in_metres(text: str, metres: float) -> None:
+    assert length(text) == pytest.approx(metres)
+
+
+@pytest.mark.parametrize("text", ["8", "0 mm", "-1 mm", "8 s", "mm", "8 furlets", "nan mm"])
+def test_what_is_no_length_is_refused(text: str) -> None:
+    with pytest.raises(UnknownUnits):
+        length(text)
+
+
+def test_a_number_and_what_stands_behind_it() -> None:
+    assert number_and_unit("-5.e1km/h") == (-50.0, "km/h")
+    assert number_and_unit("3") == (3.0, "")
+    assert number_and_unit("fast") is None
