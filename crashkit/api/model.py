@@ -138,9 +138,12 @@ class Model:
         outside = list(dict.fromkeys(sentence for of_run in beyond for sentence in of_run.values()))
         if sensitivity and len(values) > 1:
             raise DataError(f"sensitivities are those of one run; found parameters of {len(values)}")
-        u = surrogate.predict_full(values, at, number) if full else surrogate.predict(values, at, number)
+        with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused below
+            u = surrogate.predict_full(values, at, number) if full else surrogate.predict(values, at, number)
         if not np.isfinite(u).all():
-            raise DataError("the model gives numbers that are not finite for these parameters; train it again")
+            raise DataError(
+                "the model gives numbers that are not finite for these parameters; check the values, or train it again"
+            )
         unsure = [*outside, *surrogate.hard(values)]
         for sentence in unsure:
             warnings.warn(sentence, stacklevel=2)

@@ -6,6 +6,8 @@ import json
 import os
 import re
 import shutil
+import subprocess
+import sys
 import warnings
 from pathlib import Path
 
@@ -362,6 +364,58 @@ def test_a_run_of_the_dataset_stands_beside_its_prediction(
     assert 0 < json.loads(out)["mean_error_m"] < json.loads(out)["largest_error_m"]
     seen = run("predict", model, "--run", "run_000", "--dataset", crash, "-o", tmp_path / "seen.npz")[2]
     assert re.search(r"the model was (trained|tuned) on run_000", seen)
+
+
+@pytest.mark.parametrize("spoiled", [float("nan"), float("inf")])
+def test_a_model_that_gives_no_finite_numbers_is_refused(model: Path, spoiled: float) -> None:
+    broken = load(model)
+    broken.predict_full = lambda *_: np.full((1, 7, 81, 3), spoiled, np.float32)  # type: ignore[method-assign]
+    with pytest.raises(DataError, match="numbers that are not finite"):
+        predict(broken, ASKED)
+
+
+def test_a_parameter_beyond_all_measure_is_refused_or_said(model: Path, tmp_path: Path) -> None:
+    rest = asked(model)[4:]
+    for more in ((), ("--extrapolate",)):
+        arguments = (
+            "predict",
+            model,
+            "--param",
+            "impact_speed=1e300",
+            *rest,
+            *more,
+            "--json",
+            "-o",
+            tmp_path / "x.npz",
+        )
+        code, out, err = run(*arguments)
+        assert code == 1
+        assert out == ""
+        assert err.startswith("error: ")
+        assert not (tmp_path / "x.npz").exists()
+
+
+def test_a_full_disk_leaves_the_earlier_arrays(model: Path, tmp_path: Path) -> None:
+    (tmp_path / "keep.npz").write_bytes(b"earlier")
+    script = (
+        "import sys\n"
+        "from crashkit.errors import OutputError\n"
+        "from crashkit.api.predict import predict, write_prediction\n"
+        "said = predict(sys.argv[1], {'impact_speed': 20.0, 'impact_angle': 5.0, 'yield_stress': 4e8})\n"
+        "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
+        "try:\n"
+        "    write_prediction(said, sys.argv[2])\n"
+        "except OutputError as error:\n"
+        "    print(error)\n"
+    )
+    told = subprocess.run(
+        [sys.executable, "-c", script, str(model), str(tmp_path / "keep.npz")],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert told.stdout.count("\n") == 1, told.stderr
+    assert "keep.npz: cannot be written" in told.stdout
+    assert [p.name for p in tmp_path.iterdir()] == ["keep.npz"]
+    assert (tmp_path / "keep.npz").read_bytes() == b"earlier"
 
 
 def test_inside_the_trained_range_there_is_none(model: Path) -> None:

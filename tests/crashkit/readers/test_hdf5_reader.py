@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from importlib.resources import files
 from pathlib import Path
@@ -13,6 +14,7 @@ import pyvista as pv
 
 from crashkit.errors import ReadError
 from crashkit.readers import reader_for
+from crashkit.readers._mesh_file import faces_of
 from crashkit.readers.base import Parameter
 
 DEMO = Path(str(files("crashkit") / "data" / "kart_demo.h5"))
@@ -95,6 +97,14 @@ def test_faces_come_from_a_mesh_file_beside_the_data(campaign, sample, tmp_path,
     pv.PolyData.from_regular_faces(turned, sample.faces).save(mesh)
     np.testing.assert_array_equal(read(campaign, mesh=mesh)[0].mesh.face_nodes, sample.faces)
     assert mesh in read(campaign, mesh=mesh)[0].files
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+@pytest.mark.parametrize("suffix", [".vtp", ".stl"])
+def test_a_pipe_in_the_place_of_the_mesh_is_not_opened(sample, tmp_path, suffix):
+    os.mkfifo(tmp_path / f"mesh{suffix}")
+    with pytest.raises(ReadError, match="no such mesh file"):
+        faces_of(tmp_path / f"mesh{suffix}", sample.points)
 
 
 def test_a_mesh_whose_nodes_stand_in_another_order_is_refused(campaign, sample, tmp_path):
