@@ -72,8 +72,6 @@ def read_measured_points(path: Path) -> MeasuredPoints:
     named = {name.lower(): (k, unit) for k, (name, unit) in enumerate(table.columns)}
     values = np.array([row for _, row in table.rows], np.float64).reshape(len(table.rows), -1)
     numbers = np.array([number for number, _ in table.rows], np.int64)
-    if not len(values):
-        raise ReadError(f"{path}: the table has no row; expected one a measured point")
     without: list[str] = []
     used: set[int] = set()
 

@@ -203,7 +203,12 @@ def read_numbers(path: Path, keys: Sequence[str], aside: Sequence[str] = ()) -> 
     every = [k for k, title in enumerate(table.header) if _plain(title) not in aside]
     columns = parameter_columns([table.header[k] for k in every], [""] * len(every), str(path))
     first = next((k for name in keys for k in _called(table.header, name)), 0)
-    body, below = _without_units_row(table, first, [k for k in every if k != first])
+    body: list[tuple[int, list[Any]]] = table.lines
+    below: dict[int, str] = {}
+    if body and any(_text(cell) and not _PLAIN.fullmatch(_text(cell)) for cell in body[0][1]):
+        body, below = _without_units_row(table, first, [k for k in every if k != first])
+    if not body:
+        raise ReadError(f"{path}: the table has no row")
     mark = _decimal_mark(body, every, path)
     rows = [
         (
