@@ -101,6 +101,13 @@ def check_record(record: Record) -> None:
     if not all(np.isfinite(factor) and factor > 0 for _, factor in ranges.written):
         raise SurrogateError("ranges.table holds a unit without a value")
     _check_times("time", record.time)
+    runs = len(record.fitted_runs)
+    for name, values in record.parameters.items():
+        numbers(f"values of {name}", np.array(values), (runs,))
+    unknown = record.left_out.keys() - set(record.fitted_runs)
+    if unknown:
+        raise SurrogateError(f"left_out names {min(unknown)!r}, which is none of the {runs} runs it was fitted to")
+    numbers("left_out", np.array(list(record.left_out.values())).ravel(), (2 * len(record.left_out),))
 
 
 def _check_times(what: str, values: Any) -> None:

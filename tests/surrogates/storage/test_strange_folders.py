@@ -127,6 +127,8 @@ def _deep() -> Any:
         lambda about: about["files"].update({"../outside": "x"}),
         lambda about: about.update(record=3),
         lambda about: about["record"].update(time=_deep()),
+        lambda about: about["record"].update(left_out={"nobody": [0.1, 1.0]}),
+        lambda about: about["record"].update(parameters={"impact_speed": [1.0]}),
         lambda about: about["record"]["ranges"].update(low=[1.0]),
         lambda about: about.update(levels=[{"number": 99}]),
         lambda about: about.update(settings=[]),
