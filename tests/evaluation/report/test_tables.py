@@ -21,6 +21,8 @@ def test_performance_has_a_row_for_each_level_and_baseline(evaluation):
         assert row.error_cm == pytest.approx(100 * evaluation.scores[row.model].mean)
         assert row.pod_floor_cm == pytest.approx(100 * evaluation.floor_at(row.latent))
         assert row.worst_run_cm == pytest.approx(100 * evaluation.scores[row.model].of_runs.max())
+        assert row.peak_cm == pytest.approx(100 * evaluation.scores[row.model].peak_value.max())
+        assert row.reduction_cm == pytest.approx(100 * evaluation.scores[row.model].reduction)
         assert row.prediction_ms > 0
     assert [r.lifting_cm > 0 for r in rows] == [True, True, True, False, False]
 

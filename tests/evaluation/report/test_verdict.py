@@ -9,7 +9,8 @@ import pytest
 
 from evaluation.comparison.result import compare
 from evaluation.comparison.split import Split
-from evaluation.report.verdict import clearly_better, difference, statements
+from evaluation.report.verdict import BAND_HOLDS, clearly_better, difference, statements
+from surrogates.storage import tested
 
 
 def _with_errors(evaluation, **means):
@@ -149,3 +150,79 @@ def test_clearly_better_needs_more_than_a_lower_mean(evaluation):
     assert scattered.scores["MH1"].mean < scattered.scores["PODNN"].mean
     assert not clearly_better(scattered, mh1, podnn)
     assert clearly_better(_with_errors(evaluation, MH1=[0.01] * 3, PODNN=[0.02, 0.03, 0.02]), mh1, podnn)
+
+
+def _with(evaluation, label, **changes):
+    """`evaluation` with other scores of one row."""
+    scores = evaluation.scores[label]
+    filled = {name: np.full_like(getattr(scores, name), value) for name, value in changes.items()}
+    return replace(evaluation, scores={**evaluation.scores, label: replace(scores, **filled)})
+
+
+@pytest.mark.parametrize(("held", "warned"), [(0.84, True), (0.86, False), (np.nan, False)])
+def test_a_band_that_misses_its_promise_is_a_warning(evaluation, held, warned):
+    said = _said(_with(evaluation, "PODNN", covered=held), "Bands miss their promise")
+    assert bool(said) == warned
+    if warned:
+        assert "PODNN 84 %" in said[0].text
+
+
+def test_what_a_stored_model_says_of_its_band_follows_the_same_rule():
+    assert BAND_HOLDS == tested.BAND_HOLDS
+
+
+@pytest.mark.parametrize(
+    ("reduction", "source"),
+    [(0.0049, "Most of it is regression"), (0.0065, "both matter"), (0.0081, "Most of it is compression")],
+)
+def test_the_source_of_the_error_follows_from_what_compression_alone_costs(evaluation, reduction, source):
+    best = _with(_with_errors(evaluation, PODNN=[0.01] * 3), "PODNN", reconstruction=reduction)
+    (said,) = _said(best, "Where the error comes from")
+    assert said.text.startswith("The error of PODNN is 1.00 cm; its compression error")
+    assert source in said.text
+
+
+@pytest.mark.parametrize(("worst", "warned"), [(0.0195, False), (0.0205, True)])
+def test_a_run_of_more_than_twice_the_median_error_is_an_outlier(evaluation, worst, warned):
+    odd = _with_errors(evaluation, PODNN=[0.01, 0.01, worst], POD_GPR=[1] * 3, MH1=[1] * 3, MH2=[1] * 3, MH3=[1] * 3)
+    said = _said(odd, "An outlier")
+    assert bool(said) == warned
+    if warned:
+        assert "the error of PODNN is 2.0 times the median" in said[0].text
+
+
+def test_the_smallest_worst_case_is_not_that_of_the_best_mean(evaluation):
+    others = {"POD_GPR": [1] * 3, "MH2": [1] * 3, "MH3": [1] * 3}
+    two = _with_errors(evaluation, PODNN=[0.01, 0.01, 0.05], MH1=[0.03] * 3, **others)
+    assert _said(two, "Highest accuracy")[0].text.startswith("PODNN")
+    assert _said(two, "Smallest worst case")[0].text.startswith("MH1: on its worst test run, run_09, the mean")
+
+
+def test_test_runs_beyond_the_training_runs_are_named_and_left_out_once(evaluation):
+    parameters = evaluation.reference.parameters.copy()
+    inside = parameters[list(evaluation.split.train)].mean(axis=0)
+    parameters[9:] = inside
+    whole = replace(evaluation, reference=replace(evaluation.reference, parameters=parameters))
+    assert not _said(whole, "Extrapolation")
+    parameters = parameters.copy()
+    parameters[10, 0] = parameters[:9, 0].max() + 0.1
+    beyond = _with_errors(
+        replace(evaluation, reference=replace(evaluation.reference, parameters=parameters)), PODNN=[0.001, 0.004, 0.003]
+    )
+    (said,) = _said(beyond, "Extrapolation")
+    assert said.text == (
+        "1 of 3 test runs lie outside the range of the training runs: run_10. Without them PODNN has 0.20 cm."
+    )
+
+
+@pytest.mark.parametrize(("start", "warned"), [(0.0008, False), (0.0009, True)])
+def test_motion_in_the_first_state_is_a_warning_where_nothing_has_moved(evaluation, start, warned):
+    """From a tenth of the mean error on, here 0.85 mm."""
+    still = tuple(replace(run, size=np.concatenate([[0.0], run.size[1:]])) for run in evaluation.runs)
+    scores = {}
+    for label, of in evaluation.scores.items():
+        e2 = np.full_like(of.e2, 0.01)
+        e2[..., 0] = start if label == "PODNN" else 0.0
+        scores[label] = replace(of, e2=e2)
+    said = _said(replace(evaluation, runs=still, scores=scores), "Non-zero prediction at t = 0")
+    assert bool(said) == warned
