@@ -121,7 +121,7 @@ def optimise(
     known
         Parameters that are given, by name; the others are sought.
     confidence
-        With which each limit is to be kept, as far as the model knows its own error; None or 0.5: as predicted.
+        With which each limit is to be kept, as far as the model knows its own error; 0.5: as predicted.
     level
         Predict from this mesh level of the model.
     starts, samples
