@@ -8,10 +8,18 @@ import numpy as np
 from scipy import sparse
 
 from data_schema.levels import Level
+from data_schema.mirror import MirrorPlane
 from surrogates.data.campaign import Campaign
 
 SIDES = (9, 5, 3)
 TIME = np.linspace(0.0, 0.03, 7)
+
+
+# x -> 1 - x, node by node.
+MIRROR = MirrorPlane(
+    np.array([1.0, 0.0, 0.0]), 0.5,
+    sparse.csr_matrix(np.eye(SIDES[0] ** 2)[np.arange(SIDES[0] ** 2).reshape(SIDES[0], SIDES[0])[::-1].ravel()]),
+)  # fmt: skip
 
 
 def displacement(parameters: np.ndarray, time: np.ndarray = TIME) -> np.ndarray:

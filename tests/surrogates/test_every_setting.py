@@ -15,9 +15,7 @@ import numpy as np
 import plate
 import pytest
 from pydantic import BaseModel
-from scipy import sparse
 
-from data_schema.mirror import MirrorPlane
 from surrogates.data.campaign import Campaign, ElementTarget
 from surrogates.errors import SurrogateError
 from surrogates.physics import trials
@@ -121,14 +119,11 @@ MU = plate.parameters(2, seed=5)
 
 @functools.cache
 def campaign() -> Campaign:
-    mirror = MirrorPlane(
-        np.array([1.0, 0.0, 0.0]), 0.5, sparse.csr_matrix(np.eye(81)[np.arange(81).reshape(9, 9)[::-1].ravel()])
-    )
     speed, stress = (0.0, 1.0, -1.0), (1.0, -1.0, -2.0)
     bending = np.linspace(0, 1, 10 * len(plate.TIME) * 64).reshape(10, len(plate.TIME), 64).astype(np.float32)
     alive = bending < np.linspace(0.3, 1.1, 64)
     return plate.campaign(
-        10, dimensions=(speed, None, stress), mirrors=(mirror,), alive=alive,
+        10, dimensions=(speed, None, stress), mirrors=(plate.MIRROR,), alive=alive,
         targets=(ElementTarget("bending", "1", bending),),
     )  # fmt: skip
 

@@ -7,9 +7,7 @@ import plate
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import sparse
 
-from data_schema.mirror import MirrorPlane
 from surrogates.data.campaign import Campaign
 from surrogates.data.samples import Notes, ValidationSplit
 from surrogates.physics.clock import Clock
@@ -21,21 +19,17 @@ from surrogates.storage.folder import load, save
 from surrogates.training.train import train_surrogate
 
 DIMENSIONS = (SPEED, None, STRESS)
-# x -> 1 - x on the plate's grid, node by node.
-MIRROR = MirrorPlane(
-    np.array([1.0, 0.0, 0.0]), 0.5, sparse.csr_matrix(np.eye(81)[np.arange(81).reshape(9, 9)[::-1].ravel()])
-)
 
 
 def campaign(runs: int = 24, **changes: object) -> Campaign:
-    return plate.campaign(runs, dimensions=DIMENSIONS, mirrors=(MIRROR,), **changes)
+    return plate.campaign(runs, dimensions=DIMENSIONS, mirrors=(plate.MIRROR,), **changes)
 
 
 def registration(of: Campaign, a: float = 0.25) -> Registration:
     clock = Clock.of(of.parameters, 0, {0: a, 2: 0.25})
     inputs = logarithms(of.parameter_names, of.parameters, warp=True)
     grid = clock.grid(of.parameters, of.time)
-    return Registration(inputs, clock, Symmetry(MIRROR, ("impact_angle",), flagged=True), grid)
+    return Registration(inputs, clock, Symmetry(plate.MIRROR, ("impact_angle",), flagged=True), grid)
 
 
 @given(st.floats(5, 35), st.floats(1e8, 8e8), st.sampled_from([0.125, 0.25, 0.5]))
@@ -101,7 +95,7 @@ def test_a_run_and_its_image_stand_on_the_same_side_of_a_split() -> None:
 
 def test_the_image_of_an_image_is_the_run() -> None:
     states = plate.displacement(plate.parameters(1))[0]
-    symmetry = Symmetry(MIRROR)
+    symmetry = Symmetry(plate.MIRROR)
     np.testing.assert_allclose(symmetry.apply(symmetry.apply(states)), states, atol=1e-7)
 
 

@@ -8,9 +8,7 @@ import numpy as np
 import plate
 import pytest
 from numpy.typing import NDArray
-from scipy import sparse
 
-from data_schema.mirror import MirrorPlane
 from surrogates.data.campaign import Campaign
 from surrogates.data.samples import Notes
 from surrogates.models.pod_regression import Inputs, _Candidate, _errors, _held
@@ -23,16 +21,12 @@ from surrogates.settings import settings
 
 RUNS = 14
 FOLDS = Folds(np.arange(RUNS)[None] % 4)
-# x -> 1 - x on the plate's grid, node by node.
-MIRROR = MirrorPlane(
-    np.array([1.0, 0.0, 0.0]), 0.5, sparse.csr_matrix(np.eye(81)[np.arange(81).reshape(9, 9)[::-1].ravel()])
-)
 CHOSEN = {model: settings(model, overrides=["pod.points=30"]) for model in ("pod-gpr", "pod-rbf")}
 
 
 @pytest.fixture(scope="module")
 def campaign() -> Campaign:
-    return plate.campaign(RUNS, mirrors=(MIRROR,))
+    return plate.campaign(RUNS, mirrors=(plate.MIRROR,))
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +36,7 @@ def courses(campaign: Campaign) -> Courses:
 
 def registration(campaign: Campaign, *, mirrored: bool) -> Registration:
     clock = Clock.of(campaign.parameters, 0, {0: 0.25})
-    symmetry = Symmetry(MIRROR, ("impact_angle",), flagged=True) if mirrored else Symmetry()
+    symmetry = Symmetry(plate.MIRROR, ("impact_angle",), flagged=True) if mirrored else Symmetry()
     inputs = DerivedInputs.identity(campaign.parameter_names)
     return Registration(inputs, clock, symmetry, clock.grid(campaign.parameters, campaign.time))
 

@@ -10,9 +10,7 @@ import plate
 import pytest
 import torch
 from numpy.typing import NDArray
-from scipy import sparse
 
-from data_schema.mirror import MirrorPlane
 from surrogates.data.campaign import Campaign
 from surrogates.models.cascade import Cascade
 from surrogates.physics.choice import Worth
@@ -29,19 +27,12 @@ from surrogates.training.loop import Objective
 from surrogates.uncertainty import FEWEST_BY_FOLDS
 
 RUNS = 7
-# x -> 1 - x on the plate's grid, node by node.
-MIRROR = MirrorPlane(
-    np.array([1.0, 0.0, 0.0]),
-    0.5,
-    sparse.csr_matrix(np.eye(81)[np.arange(81).reshape(9, 9)[::-1].ravel()]),
-    "x = 0.5 m",
-)
 
 
 def registered(campaign: Campaign, *, clock: bool = False, mirror: bool = True) -> Registration:
     names, at = campaign.parameter_names, campaign.parameters
     own = Clock.of(at, 0, {0: 0.25}) if clock else Clock.identity(len(names))
-    symmetry = Symmetry(MIRROR, ("impact_angle",), flagged=True) if mirror else Symmetry()
+    symmetry = Symmetry(plate.MIRROR, ("impact_angle",), flagged=True) if mirror else Symmetry()
     return Registration(DerivedInputs.identity(names), own, symmetry, own.grid(at, campaign.time))
 
 
