@@ -127,7 +127,7 @@ def _time(dataset: xr.Dataset) -> Iterator[Violation]:
 
 
 def _unique(dataset: xr.Dataset) -> Iterator[Violation]:
-    for name in ("sim", "node_id", "part_id"):
+    for name in ("sim", "node_id", "part_id", *(["channel"] if "channel" in dataset.variables else [])):
         values, counts = np.unique(dataset[name].values, return_counts=True)
         if (counts > 1).any():
             yield Violation(name, f"{values[counts > 1][0]} {counts.max()} times", "each value once")

@@ -110,7 +110,7 @@ class Plan(Box):
     model
         What is trained (pod-gpr, mh, ...), with `settings`.
     until, confidence, most_runs, most_hours, least_gain
-        When the loop ends.
+        When the loop ends; hours count from the start of the command.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

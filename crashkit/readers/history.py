@@ -72,11 +72,15 @@ class History:
 def distinct(channels: list[Channel]) -> tuple[Channel, ...]:
     """Channels with names that occur once; those that occur several times are numbered in their order."""
     often = Counter(c.name for c in channels)
+    taken = {name for name, times in often.items() if times == 1}
     seen: Counter[str] = Counter()
     out = []
     for c in channels:
-        seen[c.name] += 1
-        name = f"{c.name}_{seen[c.name]}" if often[c.name] > 1 else c.name
+        name = c.name
+        while often[c.name] > 1 and (name == c.name or name in taken):
+            seen[c.name] += 1
+            name = f"{c.name}_{seen[c.name]}"
+        taken.add(name)
         out.append(Channel(name, c.quantity, c.derived))
     return tuple(out)
 

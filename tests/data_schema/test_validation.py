@@ -111,6 +111,9 @@ BROKEN: dict[str, tuple[Callable[[xr.Dataset], xr.Dataset], str]] = {
     "time no number": (lambda ds: ds.assign_coords(time=("time", [0, 1, 2, np.nan], {"units": "s"})), "time: found"),
     "run twice": (lambda ds: ds.assign_coords(sim=np.array(["a", "a"])), "sim: found a 2 times"),
     "node twice": (changed("node_id", (1,), 10), "node_id: found 10 2 times"),
+    "curve twice": (
+        lambda ds: ds.assign(channel=("channel", ["wall_force", "wall_force"])), "channel: found wall_force 2 times",
+    ),
     "face beyond nodes": (changed("face_nodes", (1, 2), 5), "face_nodes: found numbers 0 to 5, expected -1 to 4"),
     "face of two": (changed("face_nodes", (0, 1), -1), "face_nodes, face 0"),
     "part beyond": (changed("face_part", (0,), 2), "face_part: found numbers 1 to 2"),

@@ -186,3 +186,8 @@ def test_a_damaged_binout_is_one_line(tmp_path: Path) -> None:
 def test_names_that_occur_twice_are_numbered() -> None:
     names = [c.name for c in distinct([Channel("a", "force"), Channel("b", "force"), Channel("a", "force")])]
     assert names == ["a_1", "b", "a_2"]
+
+
+def test_curves_that_share_a_name_are_numbered_around_names_that_are_taken() -> None:
+    named = [Channel(name, "energy") for name in ("rail_1", "rail", "rail", "floor", "rail")]
+    assert [c.name for c in distinct(named)] == ["rail_1", "rail_2", "rail_3", "floor", "rail_4"]
