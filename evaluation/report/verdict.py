@@ -25,6 +25,7 @@ BAND_HOLDS = 0.85  # a 90 % band that holds less than this share on test runs gi
 OUTLIER = 2.0  # a test run whose error is more than this many times the median gives a warning
 MOSTLY_REGRESSION, MOSTLY_COMPRESSION = 0.5, 0.8  # shares of the error that compression alone has
 POOR_RELATIVE = 0.15  # a relative displacement error above this gives a warning
+USELESS_RELATIVE = 0.5  # above this not even trends are to be trusted
 
 RULES = (
     f"Two models are called different only if the 95 % interval of the mean difference of their errors over the test "
@@ -38,7 +39,8 @@ RULES = (
     f"The error is called regression where compression alone has less than {100 * MOSTLY_REGRESSION:.0f} % of it, and "
     f"compression where it has more than {100 * MOSTLY_COMPRESSION:.0f} %. "
     f"A warning is given for fewer than {FEW_RUNS} test runs, a relative displacement error above "
-    f"{100 * POOR_RELATIVE:.0f} %, a group of nodes whose error exceeds half of its own motion, a finer level that is "
+    f"{100 * POOR_RELATIVE:.0f} % (above {100 * USELESS_RELATIVE:.0f} % not even trends are to be trusted), "
+    f"a group of nodes whose error exceeds half of its own motion, a finer level that is "
     f"not better than the coarser one, a baseline that is better than a multi-hierarchical model, test runs outside "
     f"the range of the training runs, a 90 % band that holds less than {100 * BAND_HOLDS:.0f} %, models trained once, "
     f"a test run whose error is more than {OUTLIER:g} times the median, "
@@ -309,19 +311,17 @@ def _warnings(evaluation: Evaluation) -> list[Statement]:
                 "how much.",
             )
         )
-    poor = [
-        f"{e.label} {100 * float(masked_mean(evaluation.scores[e.label].relative)):.0f} %"
-        for e in evaluation.ranked
-        if float(masked_mean(evaluation.scores[e.label].relative)) > POOR_RELATIVE
-    ]
-    if poor:
-        out.append(
-            Statement(
-                "warning",
-                "Large relative error",
-                f"Relative displacement error: {_listed(poor)}. Good for trends, not for values at a node.",
-            )
-        )
+    relative = {e.label: float(masked_mean(evaluation.scores[e.label].relative)) for e in evaluation.ranked}
+    poor, useless = (
+        [f"{label} {100 * error:.0f} %" for label, error in relative.items() if low < error <= high]
+        for low, high in ((POOR_RELATIVE, USELESS_RELATIVE), (USELESS_RELATIVE, np.inf))
+    )
+    texts = [f"{_listed(poor)}. Good for trends, not for values at a node"] if poor else []
+    texts += (
+        [f"{_listed(useless)}. Wrong by more than half of the motion, so not good for trends either"] if useless else []
+    )
+    if texts:
+        out.append(Statement("warning", "Large relative error", f"Relative displacement error: {'. '.join(texts)}."))
     narrow = [
         f"{e.label} {100 * held:.0f} %"
         for e in evaluation.ranked

@@ -87,6 +87,18 @@ def test_a_single_test_run_ranks_nobody(reference, models):
     assert not _said(one, "Smallest worst case")
 
 
+def test_a_model_that_misses_half_of_the_motion_is_good_for_nothing(evaluation):
+    scores = {
+        label: replace(of, relative=np.full(of.relative.shape, {"PODNN": 0.2, "POD-GPR": 1.02}.get(label, 0.1)))
+        for label, of in evaluation.scores.items()
+    }
+    (said,) = _said(replace(evaluation, scores=scores), "Large relative error")
+    assert (
+        "error: PODNN 20 %. Good for trends, not for values at a node. POD-GPR 102 %. Wrong by more than half"
+        in said.text
+    )
+
+
 def test_a_large_relative_error_is_called_out(evaluation):
     assert "Relative displacement error" in _said(evaluation, "Large relative error")[0].text
 
