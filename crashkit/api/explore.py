@@ -74,7 +74,7 @@ def explore(
     if first.points is None or first.faces is None:
         raise DataError(f"{folders[0]}: the model was stored without its mesh; train it again from a dataset")
     for folder, other in zip(folders, loaded, strict=True):
-        if other.points is None or len(other.points) != len(first.points):
+        if not _same_mesh(first, other):
             raise DataError(f"{folder}: is of another mesh than {folders[0]}; a page shows models of one campaign")
     browser, largest = [], 0.0
     for k, (folder, surrogate) in enumerate(zip(folders, loaded, strict=True)):
@@ -102,6 +102,18 @@ def explore(
             f"{output}: cannot be written ({error.strerror or error}); choose another place with -o"
         ) from error
     return output
+
+
+def _same_mesh(one: Surrogate, other: Surrogate) -> bool:
+    """Whether two models are of the same nodes and faces; positions may differ by what files round."""
+    import numpy as np
+
+    if one.points is None or other.points is None or one.faces is None or other.faces is None:
+        return False
+    if one.points.shape != other.points.shape or not np.array_equal(one.faces, other.faces):
+        return False
+    size = np.ptp(one.points, axis=0).max()
+    return bool(np.allclose(one.points, other.points, rtol=0.0, atol=1e-6 * size))
 
 
 # Units as people read them on a page: unit in the model -> (unit, factor).

@@ -118,7 +118,7 @@ class Model:
         import numpy as np
         import xarray as xr
 
-        from crashkit.api.parameters import parameter_table
+        from crashkit.api.parameters import mistaken_unit, parameter_table
         from crashkit.errors import DataError
         from surrogates.data.inputs import far_outside
 
@@ -131,9 +131,11 @@ class Model:
         far = [[] if extrapolate else far_outside(ranges, row[None], at) for row in values]
         if any(far):
             said = dict.fromkeys(of_run[name] for of_run, names in zip(beyond, far, strict=True) for name in names)
+            units = [mistaken_unit(parameters, name, ranges) for name in ranges.names if any(name in f for f in far)]
             raise DataError(
-                f"{'; '.join(said)}: that is far outside, and nothing is known there; check the value and its unit, or "
-                "extrapolate: --extrapolate, from Python extrapolate=True"
+                f"{'; '.join(said)}: that is far outside, and nothing is known there; "
+                f"{'; '.join(filter(None, units)) or 'check the value and its unit'}, or extrapolate: --extrapolate, "
+                "from Python extrapolate=True"
             )
         outside = list(dict.fromkeys(sentence for of_run in beyond for sentence in of_run.values()))
         if sensitivity and len(values) > 1:

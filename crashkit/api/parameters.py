@@ -1,4 +1,9 @@
-"""The parameters a model is asked with: by name, with units if one likes, checked."""
+"""The parameters a model is asked with: by name, with units if one likes, checked.
+
+There is one rule, for Python, the command line and tables alike: a number is in the unit of the dataset (SI), as every
+number in Python is; a text is read as a cell of the parameter table would be, in the unit that it carries, else in the
+unit of the table.
+"""
 
 from __future__ import annotations
 
@@ -49,6 +54,25 @@ def parameter_values(given: Mapping[str, float | str], ranges: Ranges) -> NDArra
             for n, unit, written in zip(ranges.names, ranges.units, ranges.written, strict=True)
         ]
     )
+
+
+def mistaken_unit(given: Mapping[str, Any], name: str, ranges: Ranges) -> str:
+    """What to write where a value would lie in the trained range in the other unit, that of the table or SI; else empty."""
+    k = ranges.names.index(name)
+    low, high, unit, (written, factor) = ranges.low[k], ranges.high[k], ranges.units[k], ranges.written[k]
+    value = given[name]
+    try:
+        number = float(value)  # of a text, one without a unit
+    except (TypeError, ValueError):
+        return ""
+    other, what = (
+        (unit, f"without a unit {name} is in {written}")
+        if isinstance(value, str)
+        else (written, f"as a number {name} is in {unit}")
+    )
+    if factor == 1 or not low <= (number if isinstance(value, str) else number * factor) <= high:
+        return ""
+    return f"{what}, so for {number:g} {other} write '{number:g} {other}'"
 
 
 def _value(name: str, given: float | str, unit: str, written: tuple[str, float]) -> float:

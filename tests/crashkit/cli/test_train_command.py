@@ -324,6 +324,11 @@ def test_bare_numbers_are_in_the_unit_of_the_table(crash: Path, tmp_path: Path) 
         predict(tmp_path / "m", {**plain, "yield_stress": "400"})["displacement"],
         predict(tmp_path / "m", {**plain, "yield_stress": 4e8})["displacement"],
     )
+    with pytest.raises(DataError, match="as a number yield_stress is in Pa, so for 400 MPa write '400 MPa'"):
+        predict(tmp_path / "m", {**plain, "yield_stress": 400})
+    with pytest.raises(DataError, match="without a unit yield_stress is in MPa, so for 4e\\+08 Pa write '4e\\+08 Pa'"):
+        predict(tmp_path / "m", {**plain, "yield_stress": "4e8"})
+    predict(tmp_path / "m", {**plain, "yield_stress": "4e+08 Pa"})  # as it says
     with pytest.raises(DataError, match=r"the model takes .*yield_stress \(\d\d\d(\.\d+)? to \d\d\d(\.\d+)? MPa\)"):
         predict(tmp_path / "m", {})
     assert "| yield_stress | MPa |" in (tmp_path / "m" / "card.md").read_text()

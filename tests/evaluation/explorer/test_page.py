@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import re
 import shutil
@@ -177,14 +178,23 @@ def test_nothing_is_fetched_from_anywhere(models: dict[str, tuple[Path, Surrogat
     assert "import(" not in text
 
 
+@pytest.mark.parametrize("what", ["none", "moved", "other faces"])
 def test_models_of_different_meshes_do_not_share_a_page(
-    models: dict[str, tuple[Path, Surrogate]], tmp_path: Path
+    models: dict[str, tuple[Path, Surrogate]], tmp_path: Path, what: str
 ) -> None:
-    other = train_surrogate(plate.campaign(10), settings("pod-gpr"))
-    other.points = other.faces = None
+    other = copy.copy(models["pod-gpr"][1])
+    assert other.points is not None
+    assert other.faces is not None
+    if what == "none":
+        other.points = other.faces = None
+    elif what == "moved":
+        other.points = other.points + np.array([0.0, 0.0, 1e-3])
+    else:
+        other.faces = other.faces[::-1]
     save(other, tmp_path / "other")
     with pytest.raises(DataError, match="another mesh"):
         explore([models["mh"][0], tmp_path / "other"], tmp_path / "crash.html")
+    assert not (tmp_path / "crash.html").exists()
 
 
 def test_what_has_no_form_for_a_browser_is_refused() -> None:
