@@ -137,6 +137,13 @@ def test_a_list_of_values_asks_for_several_runs(model: crashkit.Model) -> None:
         model.predict({**ASKED, "impact_speed": [20, 22], "impact_angle": [0, 1, 2]})
 
 
+def last_bit(model: crashkit.Model, states: np.ndarray, level: int) -> float:
+    """By how much latent numbers change with the last bit of the states."""
+    change = np.random.default_rng(0).choice([-1.0, 1.0], states.shape) * np.finfo(np.float32).eps
+    others = (states.astype(np.float64) * (1 + change)).astype(np.float32)
+    return float(np.abs(model.encode(others, level) - model.encode(states, level)).max())
+
+
 @pytest.mark.parametrize("level", [1, 2])
 def test_states_are_encoded_with_their_labels(model: crashkit.Model, runs: xr.Dataset, level: int) -> None:
     latent = model.encode(runs.isel(sim=[0, 3]), level)
@@ -144,10 +151,13 @@ def test_states_are_encoded_with_their_labels(model: crashkit.Model, runs: xr.Da
     assert list(latent["sim"].values) == list(runs["sim"].values[[0, 3]])
     kept = model.surrogate.graphs.kept(level)
     own = runs["displacement"].isel(sim=3, node=kept)
-    # One run alone and among others: 32-bit products are summed in another order.
-    np.testing.assert_allclose(model.encode(own.values, level), latent[1], rtol=1e-3, atol=1e-3)
+    # One run alone and among others: 32-bit products are summed in another order. Latent numbers of weak modes are small
+    # displacements scaled up, so that the last bit of the states, and the order of sums, moves them by 1e-4 of their range.
+    bit = last_bit(model, own.values, level)
+    assert 0 < bit < 1e-3 < 0.01 * float(np.ptp(latent))
+    np.testing.assert_allclose(model.encode(own.values, level), latent[1], rtol=0, atol=4 * bit)
     np.testing.assert_allclose(
-        model.reconstruct(own, level), model.surrogate.reconstruct(own.values, level), rtol=1e-3, atol=1e-3
+        model.reconstruct(own, level), model.surrogate.reconstruct(own.values, level), rtol=0, atol=1e-6
     )
     assert latent.sizes["latent"] == model.surrogate.n_latent(level)
 
