@@ -154,7 +154,7 @@ def test_states_are_encoded_with_their_labels(model: crashkit.Model, runs: xr.Da
     # One run alone and among others: 32-bit products are summed in another order. Latent numbers of weak modes are small
     # displacements scaled up, so that the last bit of the states, and the order of sums, moves them by 1e-4 of their range.
     bit = last_bit(model, own.values, level)
-    assert 0 < bit < 1e-3 < 0.01 * float(np.ptp(latent))
+    assert 0 < bit < 1e-3 < 0.01 * float(np.ptp(latent.values))
     np.testing.assert_allclose(model.encode(own.values, level), latent[1], rtol=0, atol=4 * bit)
     np.testing.assert_allclose(
         model.reconstruct(own, level), model.surrogate.reconstruct(own.values, level), rtol=0, atol=1e-6
