@@ -41,8 +41,9 @@ from train_step import median_turns
 from crashkit.mesh.hierarchy import build_hierarchy
 from surrogates.data.campaign import Campaign
 from surrogates.data.graphs import Graphs
-from surrogates.data.inputs import InputScaling, Ranges
+from surrogates.data.inputs import Ranges
 from surrogates.data.samples import ValidationSplit
+from surrogates.data.scaling import InputScaling
 from surrogates.models.cascade import Cascade, build_level
 from surrogates.models.level import LevelNetwork
 from surrogates.record import Record

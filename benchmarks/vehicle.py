@@ -140,7 +140,7 @@ def commands(place: Path, size: Size) -> list[Command]:
             lambda s, r: s.training * s.run / r.read + 3 * s.nodes * (s.training * s.states) ** 2 / r.product, start=10.0,
         ),
         Command(
-            "train mh", trained("mh", "--set", f"level.epochs={epochs}", "--set", f"transfer.epochs={finer}"), None, 2.0,
+            "train mh", trained("mh", "--set", f"level.epochs={epochs}", "--set", f"transfer.epochs={finer / epochs:g}"), None, 2.0,
             _training_limit, start=10.0,
         ),
         Command("predict pod-gpr", predicted("pod-gpr"), 6.0, 1.0, _prediction_limit, start=2.0, wall=True),

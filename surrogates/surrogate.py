@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
-from torch import Tensor
 
 from data_schema.levels import lift
 from surrogates.data.campaign import Labels
@@ -16,15 +15,18 @@ from surrogates.data.graphs import Graphs
 from surrogates.data.inputs import over_range
 from surrogates.errors import SurrogateError
 from surrogates.local_errors import HARD, LocalErrors
-from surrogates.models.base import Network
 from surrogates.models.element_field import ElementField, faces_to_level
 from surrogates.models.pod_regression import PodRegression
 from surrogates.models.removal import Removal
-from surrogates.operators.convolutions import exportable
 from surrogates.physics.registration import Registration
 from surrogates.record import Fit, Record
 from surrogates.settings import Settings
 from surrogates.uncertainty import Band, Beliefs
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from surrogates.models.base import Network
 
 # Samples predicted at once, and how many nodes they may have together.
 _CHUNK, _AT_ONCE = 512, 1 << 21
@@ -135,11 +137,15 @@ class Surrogate:
         """(..., node of `level`, 3) -> (..., node of the full mesh, 3)"""
         if level == 0:
             return states
+        import torch
+
         flat = torch.from_numpy(np.asarray(states, np.float32).reshape(-1, *states.shape[-2:]))
         return self._lifted(flat.transpose(0, 1), level).numpy().reshape(*states.shape[:-2], -1, 3)
 
     def _lifted(self, states: Tensor, level: int) -> Tensor:
         """(node of `level`, b, 3) -> (b, node of the full mesh, 3), a view: transposing it costs more than lifting."""
+        import torch
+
         if level not in self._upward:
             self._upward[level] = self.graphs.to_full(level).astype(np.float32)
         return torch.from_numpy(lift(self._upward[level], states.transpose(0, 1).numpy()))
@@ -195,6 +201,8 @@ class Surrogate:
         x = self._states(states, number)
         if isinstance(self.core, PodRegression):
             return self.core.reconstruct(x, number)
+        import torch
+
         core = self.core
         with torch.no_grad():
             parts = [
@@ -208,6 +216,8 @@ class Surrogate:
         x = self._states(states, number)
         if isinstance(self.core, PodRegression):
             return self.core.encode(x)
+        import torch
+
         core = self.core
         with torch.no_grad():
             parts = [
@@ -375,6 +385,8 @@ class Surrogate:
         end: Callable[[Tensor], Tensor] = lambda states: states.transpose(0, 1).contiguous(),
     ) -> NDArray[np.float32]:
         """(batch, state, node, 3); `end` makes (b, node, 3) of states (node, b, 3)."""
+        import torch
+
         core, some = self.core, _chunk(self.graphs.n_nodes(number))
         at = torch.from_numpy(np.repeat(parameters, len(time), axis=0))
         when = torch.from_numpy(np.tile(time, len(parameters)))
@@ -444,7 +456,7 @@ def sensitivity(
         core = surrogate.core
         moved = (
             _forward_mode(core, values[0], times, number, k)
-            if isinstance(core, Network) and surrogate.registration.is_identity
+            if not isinstance(core, PodRegression) and surrogate.registration.is_identity
             else _central(surrogate, values[0], times, number, k)
         )
         columns.append(moved[:, chosen])
@@ -454,6 +466,10 @@ def sensitivity(
 def _forward_mode(
     network: Network, values: NDArray[np.float64], times: NDArray[np.float64], number: int, k: int
 ) -> NDArray[np.floating]:
+    import torch
+
+    from surrogates.operators.convolutions import exportable
+
     at = torch.from_numpy(values).expand(len(times), -1)
     direction = torch.zeros_like(at)
     direction[:, k] = 1.0

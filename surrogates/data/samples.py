@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from surrogates.data.campaign import Campaign
 from surrogates.data.inputs import Ranges
 from surrogates.data.shelf import Shelf, States, StoredStates
 from surrogates.errors import SurrogateError
 from surrogates.settings import Settings
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 # Fewer runs than this cannot spare any for validation.
 FEWEST_TO_SPLIT = 4
@@ -169,6 +171,8 @@ class LevelRuns:
 
     def samples(self, runs: NDArray[np.int64]) -> Tensor:
         """(sim * state, 3, node) of `runs`: rows are contiguous, so that a batch is gathered in whole states."""
+        import torch
+
         out = torch.empty(len(runs) * self.states, 3, self.nodes)
         for k, run in enumerate(runs):
             out[k * self.states : (k + 1) * self.states] = torch.from_numpy(self.read(run)).transpose(1, 2)
@@ -179,6 +183,8 @@ class LevelRuns:
 
         They are in memory, or in a temporary file where they are many.
         """
+        import torch
+
         keep = np.ones((len(runs), self.states), bool) if known is None else known
         shelf = Shelf(int(keep.sum()), (3, self.nodes))
         squares, first, largest, row = np.zeros((len(runs), self.states)), 0.0, 0.0, 0

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator
-from typing import IO
+from typing import IO, TYPE_CHECKING, TypeAlias
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from surrogates.errors import SurrogateError
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 # Bytes up to which an array stays in memory.
 IN_MEMORY = 256 << 20
@@ -78,6 +79,8 @@ class StoredStates:
         return self._shelf.rows
 
     def __getitem__(self, index: Tensor | slice) -> Tensor:
+        import torch
+
         rows = np.arange(len(self))[index] if isinstance(index, slice) else index.cpu().numpy()
         return torch.from_numpy(self._shelf.take(rows)).div_(self.scale)
 
@@ -86,12 +89,12 @@ class StoredStates:
         return (self[slice(k, min(k + count, len(self)))] for k in range(0, len(self), count))
 
 
-States = Tensor | StoredStates
+States: TypeAlias = "Tensor | StoredStates"
 
 
 def divide(states: States, by: float) -> None:
     """Divide in place, or from now on."""
-    if isinstance(states, Tensor):
-        states /= by
-    else:
+    if isinstance(states, StoredStates):
         states.scale *= by
+    else:
+        states /= by

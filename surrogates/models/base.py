@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from surrogates.data.inputs import InputScaling
+from surrogates.data.scaling import InputScaling
 from surrogates.errors import SurrogateError
 
 

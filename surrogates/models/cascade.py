@@ -10,7 +10,7 @@ from typing import Any
 from torch import Tensor
 
 from surrogates.data.graphs import Graphs
-from surrogates.data.inputs import InputScaling
+from surrogates.data.scaling import InputScaling
 from surrogates.models.base import Network, in_metres
 from surrogates.models.level import LevelNetwork
 from surrogates.operators.upsampling import Upsampling

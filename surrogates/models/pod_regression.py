@@ -14,9 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from surrogates.data.campaign import Campaign
 from surrogates.data.inputs import over_range
@@ -137,19 +135,19 @@ class PodRegression:
         kernel = sum(v.size for v in self.machine.numbers().values())
         return self.modes.size + self.data.values.size + kernel
 
-    def tensors(self) -> dict[str, dict[str, Tensor]]:
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """What has to be stored."""
         arrays: dict[str, NDArray[Any]] = {
             "modes": self.modes, "parameters": self.data.parameters, "time": self.data.time,
             "values": self.data.values, "low": self.low, "high": self.high, **self.machine.numbers(),
         }  # fmt: skip
         if self.samples is not None:
             arrays["samples"] = self.samples
-        return {"pod": {k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in arrays.items()}}
+        return {k: np.ascontiguousarray(v) for k, v in arrays.items()}
 
     @classmethod
-    def load(cls, tensors: Mapping[str, Tensor], model: str, inputs: Inputs) -> PodRegression:
-        """From what `tensors` gave."""
-        a = {k: v.numpy() for k, v in tensors.items()}
+    def load(cls, a: Mapping[str, NDArray[Any]], model: str, inputs: Inputs) -> PodRegression:
+        """From what `arrays` gave."""
         data = Coefficients(a["parameters"], a["time"], a["values"])
         samples = a.get("samples")
         x = data.parameters if inputs == "trajectory" else _points(data)[samples]

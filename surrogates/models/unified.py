@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from surrogates.data.graphs import Graphs
-from surrogates.data.inputs import InputScaling
+from surrogates.data.scaling import InputScaling
 from surrogates.errors import SurrogateError
 from surrogates.models.base import Network, in_metres
 from surrogates.operators.upsampling import Upsampling

@@ -7,7 +7,7 @@ from anybody, so nothing is used before it was looked at here.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +16,14 @@ from scipy import sparse
 from surrogates.data.campaign import Labels
 from surrogates.data.graphs import Graphs
 from surrogates.errors import SurrogateError
-from surrogates.models.base import Network
 from surrogates.models.element_field import ElementField
 from surrogates.models.pod_regression import PodRegression
 from surrogates.models.removal import Removal
 from surrogates.record import Record
 from surrogates.uncertainty import SHARES, Band
+
+if TYPE_CHECKING:
+    from surrogates.models.base import Network
 
 
 def plain_files(files: Any) -> Mapping[str, str]:

@@ -19,28 +19,22 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from safetensors.torch import load_file, save_file
+from safetensors.numpy import load_file, save_file
 from scipy import sparse
-from torch import Tensor
 
 from data_schema.levels import Level
 from data_schema.replace import beside
 from surrogates.data.campaign import Labels
 from surrogates.data.graphs import Graphs
-from surrogates.data.inputs import InputScaling
 from surrogates.errors import ModelFolderError, SurrogateError
 from surrogates.local_errors import LocalErrors
-from surrogates.models.base import Network, take_over
-from surrogates.models.cascade import Cascade, build_level
 from surrogates.models.element_field import ElementField
 from surrogates.models.pod_regression import PodRegression
 from surrogates.models.removal import Removal, Score
-from surrogates.models.unified import Unified
 from surrogates.physics.registration import Registration
 from surrogates.record import Record, ranges_as_dict, ranges_from_dict, record_as_dict, record_from_dict
 from surrogates.settings import Settings, parse
@@ -56,6 +50,9 @@ from surrogates.storage.checks import (
 )
 from surrogates.surrogate import Surrogate
 from surrogates.uncertainty import Band, Spread
+
+if TYPE_CHECKING:
+    from surrogates.models.base import Network
 
 FORMAT = 2
 _MAIN = "model.json"
@@ -111,7 +108,7 @@ def load(folder: str | Path) -> Surrogate:
         path = folder / name
         if not path.is_file():
             raise ModelFolderError(f"{path}: is missing; copy the whole model folder again")
-        if _sha256(path.read_bytes()) != digest:
+        if _sha256_of(path) != digest:
             raise ModelFolderError(f"{path}: was altered after training; copy the model folder again, or train anew")
     try:
         settings = parse(about["settings"], f"{folder / _MAIN}: settings")
@@ -147,12 +144,17 @@ def load(folder: str | Path) -> Surrogate:
 
 def _write(surrogate: Surrogate, folder: Path) -> None:
     record, core = surrogate.record, surrogate.core
-    for stem, tensors in core.tensors().items():
-        save_file({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, folder / f"{stem}.safetensors")
-    save_file(_graph_tensors(surrogate), folder / "graphs.safetensors")
-    save_file(_band_tensors(surrogate), folder / "bands.safetensors")
+    if isinstance(core, PodRegression):
+        save_file(core.arrays(), folder / "pod.safetensors")
+    else:
+        from safetensors.torch import save_file as save_tensors
+
+        for stem, tensors in core.tensors().items():
+            save_tensors({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, folder / f"{stem}.safetensors")
+    save_file(_graph_arrays(surrogate), folder / "graphs.safetensors")
+    save_file(_band_arrays(surrogate), folder / "bands.safetensors")
     if surrogate.removal is not None or surrogate.fields:
-        save_file(_element_tensors(surrogate), folder / _ELEMENTS)
+        save_file(_element_arrays(surrogate), folder / _ELEMENTS)
     histories = {str(k): {n: _plain(v) for n, v in f.history.items()} for k, f in record.fits.items()}
     (folder / "history.json").write_text(json.dumps(histories), encoding="utf-8")
     (folder / "card.md").write_text(card(surrogate), encoding="utf-8")
@@ -162,7 +164,7 @@ def _write(surrogate: Surrogate, folder: Path) -> None:
         "format": FORMAT,
         "settings": surrogate.settings.as_dict(),
         "record": _plain(record_as_dict(record)),
-        "inputs": _plain(ranges_as_dict(core.inputs.ranges if isinstance(core, Network) else record.ranges)),
+        "inputs": _plain(ranges_as_dict(record.ranges if isinstance(core, PodRegression) else core.inputs.ranges)),
         "registration": _plain(surrogate.registration.as_dict()),
         "levels": [
             {
@@ -170,13 +172,13 @@ def _write(surrogate: Surrogate, folder: Path) -> None:
                 "name": name,
                 "nodes": surrogate.graphs.n_nodes(k),
                 "scale": _scale(core, k),
-                "at_rest": isinstance(core, Cascade) and core.levels[k].at_rest,
+                "at_rest": _at_rest(core, k),
             }
             for name, k in surrogate.level_names.items()
         ],
         "parts": [] if surrogate.labels is None else list(surrogate.labels.part_name),
         "elements": _plain(_about_elements(surrogate)),
-        "files": {path.name: _sha256(path.read_bytes()) for path in sorted(folder.iterdir())},
+        "files": {path.name: _sha256_of(path) for path in sorted(folder.iterdir())},
     }
     about["sha256"] = _sha256(_canonical(about))
     (folder / _MAIN).write_text(json.dumps(about, indent=1), encoding="utf-8")
@@ -209,29 +211,44 @@ def _core(
 ) -> Network | PodRegression:
     if settings.model in ("pod-gpr", "pod-rbf"):
         return PodRegression.load(load_file(folder / "pod.safetensors"), settings.model, record.choice["inputs"])
+    from safetensors.torch import load_file as load_tensors
+
+    from surrogates.data.scaling import InputScaling
+    from surrogates.models.base import take_over
+    from surrogates.models.cascade import Cascade, build_level
+    from surrogates.models.unified import Unified
+
     ranges = ranges_from_dict(about["inputs"])
     scaling = InputScaling(ranges, products=settings.inputs.products, angles=settings.inputs.angles)
     if settings.unified:
         network = Unified(scaling, settings, graphs, tuple(entry["number"] for entry in about["levels"]))
         network.scale = float(about["levels"][0]["scale"])
-        take_over(network.state_dict(), load_file(folder / "levels.safetensors"))
+        take_over(network.state_dict(), load_tensors(folder / "levels.safetensors"))
         return network
     cascade = Cascade(scaling)
     for entry in about["levels"]:
         level = build_level(entry["number"], settings, graphs, cascade)
         level.scale = float(entry["scale"])
         level.at_rest = bool(entry["at_rest"])
-        level.load_own_state(load_file(folder / f"level_{entry['number']}.safetensors"))
+        level.load_own_state(load_tensors(folder / f"level_{entry['number']}.safetensors"))
         level.settle()
         cascade.add(entry["number"], level)
     return cascade
 
 
 def _scale(core: Network | PodRegression, number: int) -> float:
-    return core.scales[number] if isinstance(core, Network) else 1.0
+    return 1.0 if isinstance(core, PodRegression) else core.scales[number]
 
 
-def _graph_tensors(surrogate: Surrogate) -> dict[str, Tensor]:
+def _at_rest(core: Network | PodRegression, number: int) -> bool:
+    if isinstance(core, PodRegression):
+        return False
+    from surrogates.models.cascade import Cascade
+
+    return isinstance(core, Cascade) and core.levels[number].at_rest
+
+
+def _graph_arrays(surrogate: Surrogate) -> dict[str, NDArray[Any]]:
     graphs = surrogate.graphs
     arrays: dict[str, NDArray[Any]] = {"nodes": np.array([graphs.n_full])}
     if surrogate.points is not None and surrogate.faces is not None:
@@ -241,7 +258,7 @@ def _graph_tensors(surrogate: Surrogate) -> dict[str, Tensor]:
             name: np.asarray(a, np.int64) for name in _LABELS if (a := getattr(surrogate.labels, name)) is not None
         }
     numbers = surrogate.core.numbers
-    if 0 in numbers and isinstance(surrogate.core, Network) and graphs.full_edges is not None:
+    if 0 in numbers and not isinstance(surrogate.core, PodRegression) and graphs.full_edges is not None:
         arrays["edges"] = graphs.full_edges
     for level in graphs.levels[: max(numbers, default=0)]:
         prefix = f"level_{level.index}."
@@ -252,11 +269,10 @@ def _graph_tensors(surrogate: Surrogate) -> dict[str, Tensor]:
             arrays[f"{prefix}{name}.data"] = matrix.data.astype(np.float64)
             arrays[f"{prefix}{name}.indices"] = matrix.indices.astype(np.int32)
             arrays[f"{prefix}{name}.indptr"] = matrix.indptr.astype(np.int64)
-    return {k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in arrays.items()}
+    return {k: np.ascontiguousarray(v) for k, v in arrays.items()}
 
 
-def _graphs(tensors: Mapping[str, Tensor]) -> tuple[Graphs, NDArray[np.float64] | None, NDArray[np.int32] | None]:
-    a = {k: v.numpy() for k, v in tensors.items()}
+def _graphs(a: Mapping[str, NDArray[Any]]) -> tuple[Graphs, NDArray[np.float64] | None, NDArray[np.int32] | None]:
     n_full = int(a["nodes"][0])
     levels: list[Level] = []
     finer = n_full
@@ -278,40 +294,40 @@ def _graphs(tensors: Mapping[str, Tensor]) -> tuple[Graphs, NDArray[np.float64] 
     return Graphs(n_full, tuple(levels), a.get("edges")), a.get("points"), a.get("faces")
 
 
-def _labels(tensors: Mapping[str, Tensor], about: Mapping[str, Any]) -> Labels | None:
-    if "node_id" not in tensors:
+def _labels(stored: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> Labels | None:
+    if "node_id" not in stored:
         return None
-    arrays = {name: tensors[name].numpy() for name in _LABELS if name in tensors}
+    arrays = {name: stored[name] for name in _LABELS if name in stored}
     return Labels(**arrays, part_name=tuple(map(str, about["parts"])))
 
 
-def _band_tensors(surrogate: Surrogate) -> dict[str, Tensor]:
-    out: dict[str, Tensor] = {}
+def _band_arrays(surrogate: Surrogate) -> dict[str, NDArray[Any]]:
+    out: dict[str, NDArray[Any]] = {}
     for (number, lifted), band in surrogate.bands.items():
         arrays: dict[str, NDArray[Any]] = {"node": band.node, "state": band.state, "factor": band.factor}
         if band.local is not None:
             arrays |= {"points": band.local.points, "ratio": band.local.ratio, "run": band.local.run}
             arrays["width"] = np.array([band.local.width])
         prefix = f"{number}.{'full' if lifted else 'own'}."
-        out |= {prefix + k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in arrays.items()}
-        out[prefix + "runs"] = torch.tensor([band.runs])
-        out[prefix + "spread"] = torch.tensor([_SPREADS.index(band.spread)])
-        out[prefix + "unit"] = torch.tensor([band.unit], dtype=torch.float64)
+        out |= {prefix + k: np.ascontiguousarray(v) for k, v in arrays.items()}
+        out[prefix + "runs"] = np.array([band.runs])
+        out[prefix + "spread"] = np.array([_SPREADS.index(band.spread)])
+        out[prefix + "unit"] = np.array([band.unit])
     return out
 
 
-def _bands(tensors: Mapping[str, Tensor], record: Record) -> dict[tuple[int, bool], Band]:
+def _bands(stored: Mapping[str, NDArray[Any]], record: Record) -> dict[tuple[int, bool], Band]:
     out = {}
-    for key in tensors:
+    for key in stored:
         number, where, name = key.split(".")
         if name == "runs":
-            parts = {n: tensors[f"{number}.{where}.{n}"].numpy() for n in ("node", "state", "factor")}
-            spread = _SPREADS[int(tensors[f"{number}.{where}.spread"][0])]
-            unit = float(tensors[f"{number}.{where}.unit"][0])
-            runs = int(tensors[key][0])
+            parts = {n: stored[f"{number}.{where}.{n}"] for n in ("node", "state", "factor")}
+            spread = _SPREADS[int(stored[f"{number}.{where}.spread"][0])]
+            unit = float(stored[f"{number}.{where}.unit"][0])
+            runs = int(stored[key][0])
             local = None
             if spread == "local":
-                a = {n: tensors[f"{number}.{where}.{n}"].numpy() for n in ("points", "ratio", "run", "width")}
+                a = {n: stored[f"{number}.{where}.{n}"] for n in ("points", "ratio", "run", "width")}
                 local = LocalErrors(a["points"], a["ratio"], a["run"], float(a["width"][0]))
             out[int(number), where == "full"] = Band(
                 **parts, time=record.time, runs=runs, spread=spread, unit=unit, local=local
@@ -319,11 +335,11 @@ def _bands(tensors: Mapping[str, Tensor], record: Record) -> dict[tuple[int, boo
     return out
 
 
-def _element_tensors(surrogate: Surrogate) -> dict[str, Tensor]:
+def _element_arrays(surrogate: Surrogate) -> dict[str, NDArray[Any]]:
     out = {} if surrogate.removal is None else {f"removal/{k}": v for k, v in surrogate.removal.arrays().items()}
     for name, known in surrogate.fields.items():
         out |= {f"field/{name}/{k}": v for k, v in known.arrays().items()}
-    return {k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in out.items()}
+    return {k: np.ascontiguousarray(v) for k, v in out.items()}
 
 
 def _about_elements(surrogate: Surrogate) -> dict[str, Any]:
@@ -337,10 +353,10 @@ def _about_elements(surrogate: Surrogate) -> dict[str, Any]:
 
 
 def _elements(
-    tensors: Mapping[str, Tensor], about: Mapping[str, Any]
+    arrays: Mapping[str, NDArray[Any]], about: Mapping[str, Any]
 ) -> tuple[Removal | None, dict[str, ElementField]]:
     def under(prefix: str) -> dict[str, NDArray[Any]]:
-        return {k.removeprefix(prefix): v.numpy() for k, v in tensors.items() if k.startswith(prefix)}
+        return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
 
     told = about.get("removal")
     removal = None
@@ -378,6 +394,11 @@ def _canonical(about: Mapping[str, Any]) -> bytes:
 
 def _sha256(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
+
+
+def _sha256_of(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _writer(about: Mapping[str, Any]) -> str:

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from surrogates.data.campaign import Campaign
 from surrogates.data.graphs import Graphs
-from surrogates.data.inputs import InputScaling, Ranges
+from surrogates.data.inputs import Ranges
 from surrogates.data.samples import LevelRuns, Notes, check, everything, split
+from surrogates.data.scaling import InputScaling
 from surrogates.errors import SurrogateError
 from surrogates.models.cascade import Cascade
 from surrogates.models.pod_regression import PodFit, fit_pod_regression

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from surrogates.data.campaign import Campaign
 from surrogates.data.graphs import Graphs
-from surrogates.data.inputs import InputScaling
 from surrogates.data.samples import LevelRuns, Notes, ValidationSplit, scale_of
+from surrogates.data.scaling import InputScaling
 from surrogates.data.shelf import States, divide
 from surrogates.models.cascade import Cascade, build_level
 from surrogates.models.level import LevelNetwork

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from surrogates.data.inputs import InputScaling, Ranges, far_outside, over_range
+from surrogates.data.inputs import Ranges, far_outside, over_range
+from surrogates.data.scaling import InputScaling
 
 NAMES, UNITS = ("impact_speed", "impact_angle", "yield_stress"), ("m s-1", "degree", "Pa")
 

@@ -10,7 +10,8 @@ from scipy import sparse
 
 from data_schema.levels import Level
 from surrogates.data.graphs import Graphs
-from surrogates.data.inputs import InputScaling, Ranges
+from surrogates.data.inputs import Ranges
+from surrogates.data.scaling import InputScaling
 from surrogates.errors import SurrogateError
 from surrogates.models.cascade import Cascade, build_level
 from surrogates.operators.upsampling import Upsampling

@@ -7,7 +7,8 @@ import plate
 import torch
 
 from surrogates.data.graphs import Graphs
-from surrogates.data.inputs import InputScaling, Ranges
+from surrogates.data.inputs import Ranges
+from surrogates.data.scaling import InputScaling
 from surrogates.models.unified import Unified
 from surrogates.settings import settings as choose
 from surrogates.training.train import train_surrogate
