@@ -298,9 +298,9 @@ def print_rates(dataset: Path) -> None:
 
 
 def levels_of(dataset: Path) -> tuple[int, ...]:
-    from crashkit.mesh.store import has_hierarchy, read_hierarchy
+    from crashkit.mesh.store import has_hierarchy, open_hierarchy
 
-    return tuple(level.n_nodes for level in read_hierarchy(dataset).levels) if has_hierarchy(dataset) else ()
+    return tuple(level.n_nodes for level in open_hierarchy(dataset).levels) if has_hierarchy(dataset) else ()
 
 
 def of_size(place: Path, nodes: int, options: argparse.Namespace) -> Iterator[Measured]:

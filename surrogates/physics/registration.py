@@ -105,6 +105,8 @@ class Registration:
     ) -> NDArray[Any]:
         """What the `model` behind it, (run, input) and (state,) -> (run, state, ..), says of runs at their own times.
 
+        The arrays that the model gives are scaled in place.
+
         Parameters
         ----------
         parameters
@@ -117,8 +119,9 @@ class Registration:
         out = []
         for k in range(len(parameters)):
             states = model(inputs[k : k + 1], self.clock.times(parameters[k], time))
-            out.append(states * np.asarray(sizes[k], states.dtype))
-        return np.concatenate(out)
+            states *= np.asarray(sizes[k], states.dtype)  # in place: a run of the full mesh is not held twice
+            out.append(states)
+        return out[0] if len(out) == 1 else np.concatenate(out)
 
     def _inputs(self, parameters: NDArray[np.float64], computed: int) -> NDArray[np.float64]:
         out = self.inputs.apply(parameters)

@@ -104,11 +104,14 @@ def fit(
     precision: str = "float32",
     report: Callable[[Epoch], None] | None = None,
     keeper: Keeper | None = None,
+    captured: bool = False,
 ) -> Fit:
     """Train what `objective` holds and leave the weights of its best epoch in place.
 
     Samples that do not fill a batch are left out of an epoch, other ones each time. Under torchrun each process takes
     its share of every batch, so the losses are those of one process with the same `settings.batch`.
+
+    With `captured` the step is one CUDA graph where there is a CUDA device (`CapturedStep`).
 
     Raises Diverged, with the best weights so far in place and the history on it, if a loss is not finite.
     KeyboardInterrupt ends the training early with status "interrupted" once an epoch is done.
@@ -124,7 +127,8 @@ def fit(
         best = _restore(stored, names, optimiser, trained, out)
     weights = torch.tensor([settings.weight_approximation, settings.weight_reconstruction], device=device)
     cut = 1 if torch.distributed.is_initialized() else objective.pieces(plan.batch)
-    step = _Step(_distributed(objective), optimiser, weights, settings.clip, precision, cut)
+    kind = CapturedStep if captured and not torch.distributed.is_initialized() else _Step
+    step = kind(_distributed(objective), optimiser, weights, settings.clip, precision, cut)
     started, spent = time.perf_counter(), out.seconds
     try:
         for epoch in range(out.epochs, settings.epochs):
@@ -245,6 +249,10 @@ class _Step:
     def __call__(self, indices: Tensor, rate: float) -> Tensor:
         for group in self.optimiser.param_groups:
             group["lr"] = rate * group["factor"]
+        return self.taken(indices)
+
+    def taken(self, indices: Tensor) -> Tensor:
+        """The step at the rates that are set."""
         self.optimiser.zero_grad(set_to_none=True)
         losses = torch.zeros_like(self.weights)
         for part in indices.tensor_split(self.pieces):
@@ -256,6 +264,54 @@ class _Step:
             nn.utils.clip_grad_norm_(self.parameters, self.clip)
         self.optimiser.step()
         return losses
+
+
+class CapturedStep(_Step):
+    """A step whose calls are recorded once, as one CUDA graph, and then sent to the device together.
+
+    What changes from step to step, the samples' numbers and the rates, lies in tensors that stay where they are. The
+    first steps are taken one call at a time, as a capture wants it, and count as any others. Where there is no CUDA
+    device, all steps are, through the same code. Experimental: benchmarks/gpu.py measures what it is worth.
+    """
+
+    _BEFORE = 3
+
+    def __init__(
+        self, objective: nn.Module, optimiser: torch.optim.Optimizer, weights: Tensor, clip: float, precision: str,
+        pieces: int = 1,
+    ) -> None:  # fmt: skip
+        super().__init__(objective, optimiser, weights, clip, precision, pieces)
+        self.device = weights.device
+        self.cuda = self.device.type == "cuda"
+        self.graph: torch.cuda.CUDAGraph | None = None
+        self.index, self.losses = torch.empty(0, dtype=torch.int64), weights
+        self.steps = 0
+        for group in optimiser.param_groups:
+            group["lr"] = torch.tensor(0.0, device=self.device)
+            group["capturable"] = self.cuda
+
+    def __call__(self, indices: Tensor, rate: float) -> Tensor:
+        if not self.steps:
+            self.index = indices.clone()
+        self.steps += 1
+        self.index.copy_(indices)
+        for group in self.optimiser.param_groups:
+            group["lr"].fill_(rate * group["factor"])
+        if not self.cuda:
+            return self.taken(self.index)
+        if self.graph is None and self.steps <= self._BEFORE:
+            side = torch.cuda.Stream(self.device)
+            side.wait_stream(torch.cuda.current_stream(self.device))
+            with torch.cuda.stream(side):
+                losses = self.taken(self.index)
+            torch.cuda.current_stream(self.device).wait_stream(side)
+            return losses
+        if self.graph is None:
+            self.graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(self.graph):
+                self.losses = self.taken(self.index)
+        self.graph.replay()
+        return self.losses.clone()
 
 
 def _optimiser(objective: Objective, settings: LevelSettings, device: torch.device) -> torch.optim.Optimizer:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -90,3 +92,15 @@ def test_a_band_is_calibrated_on_each_left_out_run_by_what_the_model_says_of_it(
     np.testing.assert_allclose(beliefs.size, surrogate.registration.clock.size(campaign.parameters[runs]))
     assert (len(set(beliefs.deviation.tolist())) > 1) == (model == "pod-gpr")
     assert surrogate.bands[0, False].runs == 14
+
+
+def test_a_model_of_modes_and_processes_is_loaded_and_asked_without_torch(tmp_path: Path) -> None:
+    surrogate = train_surrogate(plate.campaign(6), settings("pod-gpr"))
+    save(surrogate, tmp_path / "model")
+    code = (
+        "import sys\nfrom surrogates.storage.folder import load\n"
+        f"u = load({str(tmp_path / 'model')!r}).predict([20.0, 2.0, 3e8])\n"
+        "assert 'torch' not in sys.modules\nprint(float(abs(u).max()))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert float(done.stdout) == pytest.approx(float(abs(surrogate.predict([20.0, 2.0, 3e8])).max()), rel=1e-6)

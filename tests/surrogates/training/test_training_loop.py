@@ -662,3 +662,19 @@ def test_bfloat16_is_that_of_products_alone(precision: str, kind: torch.dtype) -
     fit(objective, SETTINGS.model_copy(update={"epochs": 1}), name="x", seed=0, precision=precision)
     assert set(seen) == {kind}
     assert objective.line.weight.dtype == torch.float32
+
+
+def test_the_step_that_is_captured_on_a_gpu_goes_the_same_way_on_the_cpu() -> None:
+    eager, captured = Line(), Line()
+    first, second = trained(eager), trained(captured, captured=True)
+    assert weights(eager) == pytest.approx(weights(captured), rel=1e-6)
+    assert first.history["total"] == pytest.approx(second.history["total"], rel=1e-6)
+
+
+def test_a_batch_cut_into_pieces_gives_the_gradient_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, cut = Line(), Line()
+    trained(whole)
+    monkeypatch.setattr(Line, "pieces", lambda self, batch: 3)
+    trained(cut)
+    assert cut.steps == 3 * whole.steps
+    assert weights(whole) == pytest.approx(weights(cut), rel=1e-5)

@@ -1,0 +1,242 @@
+"""What a GPU makes of training: the paper's preset with its step as one CUDA graph, beside eager torch and torch_geometric.
+
+    python benchmarks/gpu.py -o gpu-results [--campaign kart.h5] [--epochs 20] [--vehicle 300000]
+
+One command, ten minutes on one device. Without a CUDA device it says so, and ends with code 3. It writes into the
+folder, after each part, results.json (every figure) and results.md (the same as a table):
+
+    levels     MH3, MH2 and MH1 of the paper's preset on the campaign's training runs: seconds an epoch with the step
+               captured as one graph and with one call after the other, and the error of both on the same held-out runs
+    peer       a step of the same networks of torch_geometric's ChebConv against ours, captured and not (`train_step`)
+    predict    a run of all states at each level, alone and 64 runs at once
+    vehicle    level 1 of a campaign of `--vehicle` nodes (made as `vehicle.py` does) in bfloat16 and in float32: seconds
+               an epoch, peak device memory, and the error of both
+
+The goal: an epoch of MH1 at 1165 nodes, 9696 samples, in less than 0.1 s.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+GOAL = 0.1  # s, an epoch of MH1 with 9696 samples
+NO_DEVICE = 3
+
+Results = dict[str, Any]
+
+
+def synchronised(call: Callable[[], Any]) -> float:
+    """Seconds of a call, with all that it started on the device."""
+    torch.cuda.synchronize()
+    started = time.perf_counter()
+    call()
+    torch.cuda.synchronize()
+    return time.perf_counter() - started
+
+
+def trained(data: Path, out: Path, epochs: int, captured: bool, more: tuple[str, ...] = ()) -> tuple[Any, float]:
+    """A model of the paper's preset, and the device's peak memory, GiB."""
+    import crashkit
+    from surrogates.training import loop, trainer
+
+    torch.cuda.reset_peak_memory_stats()
+
+    def fit(*arguments: Any, **named: Any) -> Any:
+        return loop.fit(*arguments, **named, captured=captured)
+
+    before = trainer.run_epochs
+    trainer.run_epochs = fit
+    try:
+        model = crashkit.train(
+            data, out, "mh", preset="paper", settings=[f"level.epochs={epochs}", "transfer.epochs=1", *more], device="cuda",
+            test=0.2, overwrite=True, progress=False,
+        )  # fmt: skip
+    finally:
+        trainer.run_epochs = before
+    return model, torch.cuda.max_memory_allocated() / 2**30
+
+
+def prepared(source: Path, place: Path, nodes: str) -> Path:
+    """The campaign as a dataset with its hierarchy."""
+    import crashkit
+
+    data = place / f"{source.stem}.zarr"
+    crashkit.ingest([source], data)
+    crashkit.coarsen(data, nodes=[int(n) for n in nodes.split(",")])
+    return data
+
+
+def errors(model: Any, data: Path) -> dict[str, float]:
+    """Mean node error on the held-out runs by level, cm, on each level's own nodes."""
+    import xarray as xr
+
+    from crashkit.mesh.store import level_displacement
+
+    out = {}
+    with xr.open_dataset(data, engine="zarr", consolidated=False) as dataset:
+        names = [str(n) for n in dataset["sim"].values]
+        held = [names.index(n) for n in model.record.held_out_runs]
+        for name, level in model.levels.items():
+            found = []
+            for run in held:
+                asked = {p: float(dataset[p].values[run]) for p in model.parameters}
+                said = model.predict(asked, level=level, extrapolate=True)["displacement"].values
+                found.append(np.linalg.norm(said - level_displacement(data, level, [run])[0], axis=-1).mean())
+            out[name] = 100 * float(np.mean(found))
+    return out
+
+
+def levels(data: Path, place: Path, options: argparse.Namespace) -> Results:
+    out: Results = {}
+    for captured in (True, False):
+        model, peak = trained(data, place / "mh", options.epochs, captured)
+        out["captured" if captured else "eager"] = {
+            "seconds_per_epoch": {name: model.surrogate.seconds_per_epoch(k) for name, k in model.levels.items()},
+            "error_cm": errors(model, data), "peak_gib": peak,
+        }  # fmt: skip
+    return out
+
+
+def peer(data: Path, place: Path, options: argparse.Namespace) -> Results:
+    """Steps of `train_step` on the device, milliseconds."""
+    import train_step as step
+
+    out: Results = {}
+    for nodes in (73, 292, 1165):
+        edges = step.band(nodes)
+        ours, theirs = step.Ours(edges, nodes).cuda(), step.Peer(edges, nodes)
+        theirs.take_weights(ours.cpu())
+        ours, theirs = ours.cuda(), theirs.cuda()
+        theirs.edge_index, theirs.lambda_max = theirs.edge_index.cuda(), theirs.lambda_max.cuda()
+        x, inputs = torch.randn(3, nodes, step.BATCH, device="cuda").permute(1, 2, 0), torch.randn(32, 4, device="cuda")
+        stacked = x.transpose(0, 1).reshape(-1, 3)
+        calls = {
+            "ours, eager": step.stepper(ours, x, inputs, fused=True),
+            "torch_geometric, eager": step.stepper(theirs, stacked, inputs, fused=True),
+        }
+        for _ in range(5):
+            for call in calls.values():
+                call()
+        out[str(nodes)] = {
+            name: 1e3 * min(synchronised(lambda c=call: [c() for _ in range(50)]) / 50 for _ in range(3))  # type: ignore[misc]
+            for name, call in calls.items()
+        }
+    return out
+
+
+def predict(data: Path, place: Path, options: argparse.Namespace) -> Results:
+    """Milliseconds of a run, and of each of 64 runs at once, by level."""
+    import crashkit
+
+    model = crashkit.load_model(place / "mh")
+    model.surrogate.core.cuda()
+    core, times = model.surrogate.core, torch.from_numpy(model.time).cuda()
+    low, high = (torch.from_numpy(a).cuda() for a in (model.record.ranges.low, model.record.ranges.high))
+    out: Results = {}
+    for name, level in model.levels.items():
+        cost = {}
+        for runs in (1, 64):
+            at = (low + (high - low) * torch.rand(runs, len(low), device="cuda", dtype=low.dtype)).repeat_interleave(
+                len(times), 0
+            )
+            with torch.no_grad():
+                cost[f"{runs} runs"] = 1e3 * min(
+                    synchronised(lambda a=at, r=runs, k=level: core(a, times.repeat(r), k)) / runs  # type: ignore[misc]
+                    for _ in range(5)
+                )
+        out[name] = cost
+    return out
+
+
+def vehicle(data: Path, place: Path, options: argparse.Namespace) -> Results:
+    from vehicle import make
+
+    from crashkit.dataset import demo_data
+
+    source = place / "vehicle.h5"
+    nodes = make(source, options.campaign or demo_data(), options.vehicle, 24, 51)
+    large = prepared(source, place, f"{nodes // 8},{nodes // 64},{nodes // 512}")
+    out: Results = {"nodes": nodes // 8}
+    for precision in ("float32", "bfloat16"):
+        more = (f"precision={precision}", "level.batch=32")
+        model, peak = trained(large, place / "vehicle", max(2, options.epochs // 4), True, more)
+        finest = list(model.levels)[-1]
+        out[precision] = {
+            "seconds_per_epoch": model.surrogate.seconds_per_epoch(model.levels[finest]), "peak_gib": peak,
+            "error_cm": errors(model, large)[finest],
+        }  # fmt: skip
+    return out
+
+
+PARTS = {"levels": levels, "peer": peer, "predict": predict, "vehicle": vehicle}
+
+
+def table(results: Results) -> str:
+    """All figures as a table, one a row."""
+
+    def rows(found: Any, path: tuple[str, ...]) -> list[str]:
+        if isinstance(found, dict):
+            return [row for key, value in found.items() for row in rows(value, (*path, str(key)))]
+        return [
+            f"| {' / '.join(path)} | {found:.4g} |" if isinstance(found, float) else f"| {' / '.join(path)} | {found} |"
+        ]
+
+    return "\n".join(["| what | figure |", "|---|---|", *rows(results, ())]) + "\n"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output", "-o", type=Path, default=Path("gpu-results"))
+    parser.add_argument("--campaign", type=Path, help="runs in the layout of the embedded ones, which are the default")
+    parser.add_argument(
+        "--nodes", default="", help="nodes of the levels; default: an eighth, then a quarter of that, twice"
+    )
+    parser.add_argument("--epochs", type=int, default=20)
+    parser.add_argument("--vehicle", type=int, default=300_000, help="nodes of the large campaign")
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
+    options = parser.parse_args()
+    if not torch.cuda.is_available():
+        print(
+            f"no CUDA device is there (torch {torch.__version__}); this benchmark needs one, and nothing was measured"
+        )
+        return NO_DEVICE
+    from crashkit.dataset import demo_data
+
+    options.output.mkdir(parents=True, exist_ok=True)
+    results: Results = {"device": torch.cuda.get_device_name(), "torch": torch.__version__}
+    with tempfile.TemporaryDirectory(prefix="gpu-") as scratch:
+        place, source = Path(scratch), options.campaign or demo_data()
+        import h5py
+
+        with h5py.File(source) as file:
+            n = file["kart/displacements"].shape[2]
+        data = prepared(source, place, options.nodes or f"{n // 8},{n // 32},{n // 128}")
+        for name in options.only:
+            started = time.perf_counter()
+            try:
+                results[name] = PARTS[name](data, place, options)
+            except Exception as error:  # what one part runs into must not cost the others
+                results[name] = {"failed": f"{type(error).__name__}: {error}"}
+            results[f"{name}, s"] = time.perf_counter() - started
+            (options.output / "results.json").write_text(json.dumps(results, indent=1), encoding="utf-8")
+            (options.output / "results.md").write_text(table(results), encoding="utf-8")
+            print(f"{name}: {results[f'{name}, s']:.0f} s", flush=True)
+    epoch = results.get("levels", {}).get("captured", {}).get("seconds_per_epoch", {}).get("MH1")
+    if epoch is not None:
+        print(f"an epoch of MH1: {epoch:.3f} s (goal, at 1165 nodes and 9696 samples: below {GOAL} s)")
+    print(table(results))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
