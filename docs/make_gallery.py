@@ -1,6 +1,6 @@
 """Make the pictures of the gallery again: `python docs/make_gallery.py demo`, where `demo` is the folder of `make demo`.
 
-Every script of examples/gallery runs in that folder. Pictures go to docs/images/gallery, the animation to the README.
+Every script of examples/gallery runs on that folder. Pictures go to docs/images/gallery, the animation to the README.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import os
 import runpy
 import shutil
 import sys
+import tempfile
 from pathlib import Path
 
 from PIL import Image
@@ -46,17 +47,24 @@ def page() -> str:
 
 
 def main() -> None:
-    """Run all scripts in the folder named on the command line."""
-    os.chdir(sys.argv[1])
+    """Run all scripts on the folder named on the command line."""
+    if len(sys.argv) != 2 or not (Path(sys.argv[1]) / "mh").is_dir():
+        sys.exit("usage: python docs/make_gallery.py demo; where demo is the folder of `make demo`")
+    demo = Path(sys.argv[1]).resolve()
     pictures = DOCS / "images" / "gallery"
     pictures.mkdir(exist_ok=True)
-    for name in ORDER:
-        made = run(name)
-        if made.suffix == ".gif":
-            shutil.copy(made, DOCS / "images" / "crash.gif")
-        else:
-            Image.open(made).convert("RGB").quantize(128).save(pictures / made.name, optimize=True)
-        print(name, flush=True)
+    with tempfile.TemporaryDirectory() as place:  # the demo has pictures of its own, such as levels.png
+        for name in ("kart.zarr", "mh", "pod-gpr"):
+            (Path(place) / name).symlink_to(demo / name)
+        os.chdir(place)
+        for name in ORDER:
+            made = run(name)
+            if made.suffix == ".gif":
+                shutil.copy(made, DOCS / "images" / "crash.gif")
+            else:
+                Image.open(made).convert("RGB").quantize(128).save(pictures / made.name, optimize=True)
+            print(name, flush=True)
+        os.chdir(demo)
 
 
 if __name__ == "__main__":

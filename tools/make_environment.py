@@ -94,14 +94,15 @@ def run(command: list[str], folder: Path, log: Path, display: Display) -> None:
 
 
 def main() -> None:
-    """Make the folder named on the command line."""
-    folder = Path(sys.argv[1]).resolve()
+    """Make the folder named on the command line, `.venv` without a name."""
+    name = sys.argv[1] if len(sys.argv) > 1 else ".venv"
+    folder = Path(name).resolve()
     display = Display()
     if sys.version_info < (3, 11):  # noqa: UP036 - whoever starts this may have an older Python
         sys.exit(f"Python {sys.version.split()[0]} found; crashkit needs 3.11 or later: make PYTHON=python3.12")
     windows = sys.platform == "win32"
     python = folder / ("Scripts/python.exe" if windows else "bin/python")
-    display.heading(f"[1/3] virtual environment in {sys.argv[1]} (about 3 GB in the end; once, some minutes)")
+    display.heading(f"[1/3] virtual environment in {name} (about 3 GB in the end; once, some minutes)")
     folder.mkdir(parents=True, exist_ok=True)
     log = folder / "install.log"
     log.unlink(missing_ok=True)
@@ -112,7 +113,8 @@ def main() -> None:
     run([*pip, "--upgrade", "pip>=25.1"], folder, log, display)  # the first that knows dependency groups
     display.heading("[3/3] crashkit, its extras and the development tools, as listed in constraints.txt")
     run([*pip, "-c", "constraints.txt", "-e", ".[all]", "--group", "dev"], folder, log, display)
-    display.heading(f"ready: {sys.argv[1]}; to use it in a shell: source {sys.argv[1]}/bin/activate")
+    use = rf"{name}\Scripts\activate" if windows else f"source {name}/bin/activate"
+    display.heading(f"ready: {name}; to use it in a shell: {use}")
 
 
 if __name__ == "__main__":
