@@ -374,6 +374,17 @@ class StoredLevel:
         at = parameters[list(self.order)]
         return self.surrogate.band(share, time, self.level, full=True, parameters=at) if known else None
 
+    def element_fields(
+        self, parameters: NDArray[np.float64], time: NDArray[np.float64]
+    ) -> Mapping[str, NDArray[np.float32]]:
+        at = parameters[list(self.order)]
+        return {name: self.surrogate.predict_field(name, at, time) for name in self.surrogate.fields}
+
+    def removal(self, parameters: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float32] | None:
+        if self.surrogate.removal is None:
+            return None
+        return self.surrogate.predict_removal(parameters[list(self.order)], time)
+
 
 def as_model(surrogate: Surrogate, folder: Path, reference: Reference) -> Model:
     """A surrogate, stored in `folder`, as evaluation sees it: one predictor a level, and the runs it has seen.

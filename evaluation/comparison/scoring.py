@@ -8,15 +8,16 @@ them together in the order of the test runs, which makes the result independent 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from data_schema.levels import Level, lift
+from evaluation.comparison.elements import ElementScores, score_elements
 from evaluation.comparison.predictor import NOMINAL, Banded, Predictor
 from evaluation.comparison.reference import Reference
-from evaluation.comparison.sensors import Parted, Sensors, Watched, joined, part_error, watch
+from evaluation.comparison.sensors import Parted, Sensors, Watched, joined, largest_of_parts, part_error, watch
 from evaluation.errors import EvaluationError
 from evaluation.measures.distance import Peak, masked_mean, mean_node_error, node_distance
 from evaluation.measures.projection import last_seen, projection_error
@@ -91,6 +92,8 @@ class RunScores:
         Level >= 1 -> (state,) error of lifting the truth itself from that level: what the mesh costs.
     watched
         What the sensors see of the truth.
+    elements
+        What predictors say of elements, of those that do.
     """
 
     run: int
@@ -100,6 +103,7 @@ class RunScores:
     floor: Mapping[int, NDArray[np.float64]]
     lifting: Mapping[int, NDArray[np.float64]]
     watched: Watched | None = None
+    elements: Mapping[Key, ElementScores] = field(default_factory=dict)
 
 
 def score_run(
@@ -143,6 +147,7 @@ def score_run(
             scores[key] = _score(reference, predictor, run, truth, motion, gathering, sensors)
         except EvaluationError as error:
             raise EvaluationError(f"{predictor.name} on run {reference.runs[run]}: {error}") from error
+    elements = {key: found for key, p in predictors.items() if (found := score_elements(reference, p, run)) is not None}
     floor = {
         level: projection_error(truth if level == 0 else truth[:, reference.level(level).kept], basis)
         for level, basis in (modes or {}).items()
@@ -158,6 +163,7 @@ def score_run(
         else joined(
             [watch(reference, sensors, run, truth[s], _part(motion, s)) for s in state_blocks(*truth.shape[:2])]
         ),
+        elements,
     )
 
 
@@ -307,6 +313,8 @@ class Scores:
         (seed, run, state, probe, 3) displacements; empty without sensors.
     intrusion
         (seed, run, state).
+    part_intrusion
+        (seed, run, part) largest of each run.
     """
 
     e2: NDArray[np.float64]
@@ -328,6 +336,7 @@ class Scores:
     true_deformation: NDArray[np.float64]
     probes: NDArray[np.float64]
     intrusion: NDArray[np.float64]
+    part_intrusion: NDArray[np.float64]
 
     @property
     def of_runs(self) -> NDArray[np.float64]:
@@ -385,6 +394,7 @@ def gather(runs: Iterable[RunScores], keys: Sequence[Key]) -> Scores:
         true_deformation=np.array([s.parted.true_deformation for s in table[0]]),
         probes=np.array([[s.watched.probes for s in row if s.watched] for row in table]),
         intrusion=np.array([[s.watched.intrusion for s in row if s.watched] for row in table]),
+        part_intrusion=np.array([[largest_of_parts(s.watched.parts) for s in row if s.watched] for row in table]),
     )  # fmt: skip
 
 
@@ -398,7 +408,7 @@ def contributions(lifted: Mapping[str, NDArray[np.floating]]) -> dict[str, NDArr
     """
     out: dict[str, NDArray[np.floating]] = {}
     before: NDArray[np.floating] | None = None
-    for name, field in lifted.items():
-        out[name] = field if before is None else field - before
-        before = field
+    for name, one in lifted.items():
+        out[name] = one if before is None else one - before
+        before = one
     return out

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from evaluation.comparison.reference import Reference
 from evaluation.errors import EvaluationError
 from evaluation.measures.probes import intrusion
-from evaluation.measures.rigid import RigidMotion, fit_both, split_by_motions
+from evaluation.measures.rigid import RigidMotion, fit_both, fit_rigid, split_by_motions
 
 AXES = {"x": 0, "y": 1, "z": 2}
 N_PROBES = 4
@@ -42,10 +42,13 @@ class Watched:
         (state, probe, 3) m, displacement.
     intrusion
         (state,) m, of the node furthest in.
+    parts
+        (state, part) m, of the node of each part that is furthest in, along the same direction and seen by the same observer.
     """
 
     probes: NDArray[np.float64]
     intrusion: NDArray[np.float64]
+    parts: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -117,14 +120,27 @@ def watch(
         The rigid motion of all nodes of `field`, where it is known.
     """
     intruding = sensors.intruding
+    parts = np.full((len(field), len(reference.part_names)), np.nan)
     if np.isfinite(field[:, intruding[0]]).any() or np.isfinite(field[:, intruding]).any():
         position = reference.position_of(run)
         whole = sensors.watching is not None and len(sensors.watching) == reference.n_nodes
         known = motion if whole else None
         seen = intrusion(position, field, intruding, sensors.direction, sensors.watching, known).history
+        if known is None and sensors.watching is not None:
+            known = fit_rigid(position, field, sensors.watching)
+        for k, nodes in enumerate(reference.part_nodes() if len(reference.part_names) > 1 else ()):
+            if len(nodes) and np.isfinite(field[:, nodes]).any():
+                of_part = intrusion(position, field, nodes, sensors.direction, sensors.watching, known)
+                parts[:, k] = of_part.history
     else:
         seen = np.full(len(field), np.nan)
-    return Watched(field[:, sensors.probes].astype(np.float64), seen)
+    return Watched(field[:, sensors.probes].astype(np.float64), seen, parts)
+
+
+def largest_of_parts(parts: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(part,) the largest intrusion of (state, part); NaN where a part is gone throughout."""
+    largest = np.where(np.isfinite(parts), parts, -np.inf).max(axis=0)
+    return np.where(np.isfinite(largest), largest, np.nan)
 
 
 def part_error(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,10 +31,14 @@ class ErrorOfGroups:
     errors: Mapping[str, NDArray[np.float64]]
     about: str = ""
 
+    label: ClassVar[str] = "mean node error (cm)"
+    verb: ClassVar[str] = "moves"
+    columns: ClassVar[tuple[str, str]] = ("mean_displacement_cm", "mean_node_error_cm")
+
     def numbers(self) -> Columns:
-        columns: dict[str, list[object]] = {self.what: list(self.names), "mean_displacement_cm": list(self.size * CM)}
+        columns: dict[str, list[object]] = {self.what: list(self.names), self.columns[0]: list(self.size * CM)}
         for model, errors in self.errors.items():
-            columns[f"{model} mean_node_error_cm"] = list(errors * CM)
+            columns[f"{model} {self.columns[1]}"] = list(errors * CM)
         return columns
 
     def _order(self) -> NDArray[np.intp]:
@@ -58,11 +62,11 @@ class ErrorOfGroups:
         ax.set_ylim(-0.6, len(order) - 0.4)
         ax.grid(axis="y", visible=False)
         ax.set_xlim(left=0)
-        ax.set_xlabel("mean node error (cm)")
+        ax.set_xlabel(self.label)
         sheet.legend(figure, ax)
         for y, k in zip(at, order, strict=True):
             ax.text(
-                1.01, y, f"moves {self.size[k] * CM:.1f} cm", transform=ax.get_yaxis_transform(), ha="left",
+                1.01, y, f"{self.verb} {self.size[k] * CM:.1f} cm", transform=ax.get_yaxis_transform(), ha="left",
                 va="center", fontsize=7, color=INK, alpha=0.65,
             )  # fmt: skip
         ax.margins(x=0.25)

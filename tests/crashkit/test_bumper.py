@@ -17,6 +17,9 @@ from crashkit.cli.coarsen import show
 from crashkit.mesh.store import summarize_hierarchy
 from crashkit.writers.paraview import read_state
 from evaluation.comparison.result import Evaluation
+from evaluation.figures import drawings, sheet_of
+from evaluation.figures.kind import drawn
+from evaluation.measures.rigid import fit_rigid
 
 PARTS = ("bumper_beam", "crash_box_left", "crash_box_right", "flange_plates", "rail_left", "rail_right", "rear_plate")
 # Places of training runs, several of which lose elements, and of two test runs that do.
@@ -145,6 +148,54 @@ def test_errors_come_by_part(
         nodes = np.unique(one["face_nodes"].values[one["face_part"].values == k])
         expected = np.nanmean(error[:, nodes[nodes >= 0]], axis=1).mean()
         assert evaluation.scores["POD-GPR"].groups["part"][0, 1, k] == pytest.approx(expected, rel=1e-4, abs=1e-6)
+
+
+def test_the_evaluation_scores_what_is_said_of_elements(
+    few: xr.Dataset, models: tuple[crashkit.Model, crashkit.Model], evaluation: Evaluation
+) -> None:
+    entry = next(e for e in evaluation.entries if e.label == "POD-GPR")
+    one = few.isel(sim=-1).compute()
+    values = {name: float(one[name]) for name in models[0].parameters}
+    said = models[0].predict(values, extrapolate=True)
+    scores = evaluation.runs[-1].elements[entry.keys[0]]
+    alive, part = one["alive"].values, one["face_part"].values
+    called = said["removal_probability"].values > 0.5
+    assert scores.removal is not None
+    assert (scores.removal.right, scores.removal.called, scores.removal.gone) == (
+        int((called & ~alive).sum()), int(called.sum()), int((~alive).sum()),
+    )  # fmt: skip
+    off = np.abs(said["plastic_strain"].values - one["plastic_strain"].values)
+    for k in range(len(PARTS)):
+        expected = off[:, part == k][alive[:, part == k]].mean()
+        assert scores.fields["plastic_strain"].error[k] == pytest.approx(expected, rel=1e-4)
+
+
+def test_intrusion_comes_by_part(few: xr.Dataset, evaluation: Evaluation) -> None:
+    sensors = evaluation.sensors
+    assert sensors is not None
+    one = few.isel(sim=-1).compute()
+    position, u = one["reference_position"].values, one["displacement"].values
+    motion = fit_rigid(position, u)
+    along = motion.deformation(position, u) @ sensors.direction
+    watched = evaluation.runs[-1].watched
+    assert watched is not None
+    for k in range(len(PARTS)):
+        nodes = np.unique(one["face_nodes"].values[one["face_part"].values == k])
+        expected = np.nanmax(along[:, nodes[nodes >= 0]], axis=1)
+        np.testing.assert_allclose(watched.parts[:, k], expected, atol=1e-6)
+
+
+def test_the_report_shows_elements_and_parts(evaluation: Evaluation) -> None:
+    found = {
+        kind.name: drawing for kind, drawing in drawings(evaluation, ["part_intrusion", "removal", "element_fields"])
+    }
+    assert set(found) == {"part_intrusion", "removal", "element_fields"}
+    sheet = sheet_of(evaluation)
+    for drawing in found.values():
+        assert len(next(iter(drawing.numbers().values()))) in (2, len(PARTS))
+        drawn(drawing, sheet)
+    assert "precision" in found["removal"].caption()
+    assert "Plastic strain" in found["element_fields"].caption()
 
 
 def test_a_run_beside_its_truth_in_paraview_hides_what_has_failed(

@@ -230,7 +230,7 @@ def one_score(rng: np.random.Generator, watched: bool = True) -> RunScore:
         e2=draw(4), reconstruction=draw(4), q95=draw(4), largest=draw(4), on_level=draw(3), on_level_reconstruction=draw(3),
         relative=float(draw()), peak=Peak(float(draw()), int(rng.integers(4)), int(rng.integers(5))), node_sum=draw(5),
         node_count=rng.integers(1, 5, 5), groups={"part": draw(2)}, parted=Parted(draw(4), draw(4), draw(4), draw(4)),
-        watched=Watched(draw(4, 2, 3), draw(4)) if watched else None, covered=float(draw()),
+        watched=Watched(draw(4, 2, 3), draw(4), draw(4, 3)) if watched else None, covered=float(draw()),
     )  # fmt: skip
 
 
@@ -420,7 +420,9 @@ def test_nodes_on_one_line_are_watched_from_the_ground():
     line = np.column_stack([np.linspace(0, 1, 11), np.zeros(11), np.zeros(11)])
     moved = np.zeros((2, 11, 3), np.float32)
     moved[1, :, 2] = np.linspace(0, -0.1, 11)
-    structure = SimpleNamespace(position=line, n_nodes=11, displacement=lambda run: moved, position_of=lambda run: line)
+    structure = SimpleNamespace(
+        part_names=("line",), position=line, n_nodes=11, displacement=lambda run: moved, position_of=lambda run: line
+    )
     sensors = choose_sensors(structure)
     assert sensors.watching is None
     assert "from the ground, since all nodes lie on one line" in sensors.about

@@ -58,6 +58,10 @@ def parsed(path: Path) -> _Page:
     return page
 
 
+# Shown where models say something of elements; tests/crashkit/test_bumper.py draws them.
+OF_ELEMENTS = ("removal", "element_fields")
+
+
 @pytest.fixture(scope="module")
 def report(evaluation, tmp_path_factory) -> Iterator[Path]:
     with pytest.MonkeyPatch.context() as small:  # software rendering of large pictures takes most of a minute
@@ -70,6 +74,8 @@ def report(evaluation, tmp_path_factory) -> Iterator[Path]:
 def test_every_figure_is_there_three_times(report):
     page = parsed(report)
     for name in ORDER:
+        if name in OF_ELEMENTS:
+            continue
         assert f"figure-{name}" in page.ids
         png, svg, numbers = (report.parent / "figures" / f"{name}.{s}" for s in ("png", "svg", "csv"))
         assert png.read_bytes().startswith(b"\x89PNG")
