@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     from surrogates.surrogate import Surrogate
 
 
-SUFFIXES = (*paraview.SUFFIXES, ".npz")
+SUFFIXES = (*paraview.SUFFIXES, ".npz", ".zarr")
+# A folder of this name, and one in it, is an LS-DYNA family.
+D3PLOT = "d3plot"
 
 
 def load_model(folder: str | Path) -> Model:
@@ -130,13 +132,23 @@ def hidden_above(prediction: xr.Dataset, share: float) -> xr.Dataset:
     return prediction.assign(alive=(probability.dims, probability.values <= share))
 
 
-def write_prediction(prediction: xr.Dataset, output: str | Path, about: Mapping[str, str] | None = None) -> list[Path]:
+def write_prediction(
+    prediction: xr.Dataset,
+    output: str | Path,
+    about: Mapping[str, str] | None = None,
+    template: str | Path | None = None,
+) -> list[Path]:
     """Write what `predict` returned for one run to `output` by its suffix.
+
+    A folder called d3plot becomes an LS-DYNA family, `.zarr` (and `.vtp` of several states) the layout of PhysicsNeMo
+    Curator.
 
     Parameters
     ----------
     about
         Texts to stand in ParaView files: the name of the model, of the run.
+    template
+        A d3plot of the same model, whose geometry and units a d3plot gets.
 
     Raises
     ------
@@ -152,16 +164,31 @@ def write_prediction(prediction: xr.Dataset, output: str | Path, about: Mapping[
     from data_schema.replace import beside
 
     output = Path(output)
-    if output.suffix not in SUFFIXES:
-        raise OutputError(f"{output}: the suffix says what is written; expected one of {', '.join(SUFFIXES)}")
+    if output.suffix not in SUFFIXES and not _is_family(output):
+        raise OutputError(
+            f"{output}: the suffix says what is written; expected one of {', '.join(SUFFIXES)}, or a folder {D3PLOT}"
+        )
+    if template is not None and not _is_family(output):
+        raise OutputError(f"{output}: a template is for LS-DYNA; expected a folder called {D3PLOT}")
     if "sim" in prediction.dims:
         count = prediction.sizes["sim"]
         raise DataError(f"{output}: holds one run, and {count} were predicted; choose one with .isel(sim=0)")
     if "reference_position" not in prediction or "face_nodes" not in prediction:
         raise DataError(f"{output}: the model was stored without its mesh; train it again from a dataset")
+    states = prediction.sizes["time"]
+    if _is_family(output):
+        from crashkit.writers.d3plot import write_d3plot
+
+        predicted = prediction.assign(displacement=prediction["predicted"]) if "predicted" in prediction else prediction
+        named = (about or {}).get("run") or "prediction"
+        return write_d3plot(predicted, output, template, f"{named} by {prediction.attrs['model']}")
+    if output.suffix == ".zarr" or (output.suffix == ".vtp" and states > 1):
+        from crashkit.writers.physicsnemo import write_physicsnemo
+
+        predicted = prediction.assign(displacement=prediction["predicted"]) if "predicted" in prediction else prediction
+        return write_physicsnemo(predicted, output)
     if output.suffix != ".npz":
-        states = prediction.sizes["time"]
-        if output.suffix in (".vtu", ".vtp") and states != 1:
+        if output.suffix == ".vtu" and states != 1:
             raise DataError(f"{output}: holds one state, and {states} were asked for; choose one with --time, or .pvd")
         return write_run(prediction, output, {"model": str(prediction.attrs["model"]), **(about or {})})
     names = ["displacement", "reference_position", "node_id", "predicted", "error"]
@@ -178,3 +205,7 @@ def write_prediction(prediction: xr.Dataset, output: str | Path, about: Mapping[
             f"another place with -o"
         ) from error
     return [output]
+
+
+def _is_family(output: Path) -> bool:
+    return not output.suffix and D3PLOT in (output.name, output.parent.name)

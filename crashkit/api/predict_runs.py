@@ -122,6 +122,8 @@ def predict_runs(
     band: float | None = None,
     sensitivity: bool = False,
     hide_above: float = 0.5,
+    template: str | Path | None = None,
+    workers: int = 1,
     report: Progress = silent,
 ) -> list[PredictedRun]:
     """Predict runs and write them. Give one of `parameters`, `table` and `run`.
@@ -131,8 +133,9 @@ def predict_runs(
     model
         As `crashkit.train` or `crashkit.load_model` return it, or the path of its folder.
     output
-        `.pvd`, `.vtkhdf`, `.vtu`, `.vtp` or `.npz`; of a table a folder, or a name with such a suffix, to which the name
-        of the run is added.
+        `.pvd`, `.vtkhdf`, `.vtu`, `.vtp`, `.npz` or `.zarr`, or a folder called d3plot (`crashkit.api.predict`); of a table
+        a folder, or a name with such a suffix, to which the name of the run is added. In a folder d3plot every run of a
+        table has a family in a folder of its own.
     parameters
         Values by name, as `crashkit.Model.predict` takes them.
     table
@@ -143,8 +146,12 @@ def predict_runs(
         As for `crashkit.Model.predict`. By default a known run is predicted at its own times.
     hide_above
         Elements that are gone with more than this probability are hidden in ParaView files, where no truth says more.
+    template
+        A d3plot of the same model, whose geometry and units a d3plot gets.
+    workers
+        Processes that share the rows of a table; the model must then be a folder.
     report
-        Called with (what, 0, 0, "") before each run.
+        Called with (what, runs done, runs, "").
 
     Raises
     ------
@@ -155,27 +162,77 @@ def predict_runs(
     OutputError
         Where `output` cannot be written.
     """
-    from crashkit.api.predict import beside_truth, hidden_above, model_in_hand, write_prediction
+    from crashkit.api.predict import model_in_hand
+    from crashkit.errors import DataError
+    from crashkit.parallel import as_finished
 
     asked = model_in_hand(model)
-    rows = []
-    for wanted in _wanted(asked.record, Path(output), parameters, table, run, dataset):
-        report(f"predicting {wanted.run or asked.name}", 0, 0, "")
-        truth = wanted.truth
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # they are kept in the result
-            prediction = asked.predict(
-                wanted.parameters, truth["time"].values if time is None and truth is not None else time, level, full,
-                extrapolate=extrapolate, band=band, sensitivity=sensitivity,
-            )  # fmt: skip
-        if truth is not None:
-            prediction = beside_truth(prediction, truth)
-        prediction = hidden_above(prediction, hide_above)
-        about = {"model_name": f"{prediction.attrs['model']} of {asked.name}"}
-        files = write_prediction(prediction, wanted.output, about | ({"run": wanted.run} if wanted.run else {}))
-        row = _predicted(wanted, prediction, files, asked.record, hide_above)
-        rows.append(row if band is None else replace(row, band=_band(prediction, band, asked)))
-    return rows
+    wanted = _wanted(asked.record, Path(output), parameters, table, run, dataset)
+    how = _How(time, level, full, extrapolate, band, sensitivity, hide_above, template)
+    if workers == 1 or len(wanted) == 1:
+        rows = []
+        for k, one in enumerate(wanted):
+            report(f"predicting {one.run or asked.name}", k, len(wanted) if len(wanted) > 1 else 0, "")
+            rows.append(_one(asked, one, how))
+        return rows
+    if asked.folder is None:
+        raise DataError("several processes each load the model; give its folder, or workers=1")
+    found: dict[int, PredictedRun] = {}
+    report("runs", 0, len(wanted), "")
+    for place, row in as_finished(
+        _one_elsewhere, wanted, (asked.folder.resolve(), how), workers=workers, label=lambda w: w.run
+    ):
+        found[place] = row
+        report("runs", len(found), len(wanted), wanted[place].run)
+    return [found[k] for k in range(len(wanted))]
+
+
+@dataclass(frozen=True)
+class _How:
+    """What all runs are asked alike; see `predict_runs`."""
+
+    time: ArrayLike | None
+    level: int | None
+    full: bool | None
+    extrapolate: bool
+    band: float | None
+    sensitivity: bool
+    hide_above: float
+    template: str | Path | None
+
+
+def _one(asked: Model, wanted: _Wanted, how: _How) -> PredictedRun:
+    """Predict one run and write it."""
+    from crashkit.api.predict import beside_truth, hidden_above, write_prediction
+
+    truth, time = wanted.truth, how.time
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # they are kept in the result
+        prediction = asked.predict(
+            wanted.parameters, truth["time"].values if time is None and truth is not None else time, how.level, how.full,
+            extrapolate=how.extrapolate, band=how.band, sensitivity=how.sensitivity,
+        )  # fmt: skip
+    if truth is not None:
+        prediction = beside_truth(prediction, truth)
+    prediction = hidden_above(prediction, how.hide_above)
+    about = {"model_name": f"{prediction.attrs['model']} of {asked.name}"} | ({"run": wanted.run} if wanted.run else {})
+    files = write_prediction(prediction, wanted.output, about, how.template)
+    row = _predicted(wanted, prediction, files, asked.record, how.hide_above)
+    return row if how.band is None else replace(row, band=_band(prediction, how.band, asked))
+
+
+# The model of a worker, which is loaded once for all its runs.
+_loaded: dict[Path, Model] = {}
+
+
+def _one_elsewhere(wanted: _Wanted, shared: tuple[Path, _How]) -> PredictedRun:
+    from crashkit.api.predict import load_model
+
+    folder, how = shared
+    if folder not in _loaded:
+        _loaded.clear()
+        _loaded[folder] = load_model(folder)
+    return _one(_loaded[folder], wanted, how)
 
 
 def _band(prediction: xr.Dataset, share: float, model: Model) -> PredictedBand:
@@ -221,13 +278,18 @@ def _wanted(
 
 
 def _of_table(record: Record, output: Path, table: Path) -> list[_Wanted]:
-    from crashkit.api.predict import SUFFIXES
+    from crashkit.api.predict import D3PLOT, SUFFIXES
     from crashkit.errors import OutputError
     from crashkit.ingestion.parameter_table import read_parameter_table
     from crashkit.output import file_name
 
     if output.suffix and output.suffix not in SUFFIXES:
         raise OutputError(f"{output}: of a table, expected a folder, or NAME.pvd, NAME.vtkhdf or NAME.npz")
+    if output.name == D3PLOT:
+        return [
+            _Wanted(row.run, row.parameters, output / row.output.stem)
+            for row in _of_table(record, output.with_name("of_a_table"), table)
+        ]
     return [
         _Wanted(
             row,

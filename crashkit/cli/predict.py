@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -39,7 +40,8 @@ def command(
         typer.Option(
             "--output",
             "-o",
-            help="run.pvd, run.vtkhdf (ParaView), run.vtu (one state) or run.npz; of a table: a folder or NAME.pvd.",
+            help="run.pvd, run.vtkhdf (ParaView), run.vtu (one state), run.npz, d3plot/ (LS-DYNA), run.zarr or run.vtp "
+            "(PhysicsNeMo); of a table: a folder or NAME.pvd.",
         ),
     ] = Path("prediction.pvd"),
     time: Annotated[
@@ -69,11 +71,22 @@ def command(
             help="Hide elements that are gone with more than this probability (ParaView files).", min=0, max=1
         ),
     ] = 0.5,
+    template: Annotated[
+        Path | None,
+        typer.Option(
+            help="With -o d3plot/: a d3plot of the same model, whose geometry and units are taken.", show_default="none"
+        ),
+    ] = None,
+    write_series: Annotated[
+        bool, typer.Option("--write-series", help="With --params: write the rows in parallel, on all processors.")
+    ] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Predict runs and write them for ParaView or as arrays."""
     if sum((bool(param), params is not None, bool(run))) > 1:
         fail("give one of --param, --params and --run", code=2)
+    if write_series and params is None:
+        fail("--write-series writes the rows of a table; give it with --params runs.csv", code=2)
     if bool(run) != (dataset is not None):
         fail("--run and --dataset belong together: --run run_008 --dataset crash.zarr", code=2)
     asked = None if params is not None or run else given(param or ())
@@ -84,7 +97,8 @@ def command(
         rows = predict_runs(
             model, output, parameters=asked, table=params, run=run or None,
             dataset=dataset, time=times, level=level, full=full or None, extrapolate=extrapolate, band=band,
-            sensitivity=sensitivity, hide_above=hide_above, report=shown.step,
+            sensitivity=sensitivity, template=template, workers=(os.cpu_count() or 1) if write_series else 1,
+            hide_above=hide_above, report=shown.step,
         )  # fmt: skip
     if json:
         documents = [row.as_dict() for row in rows]

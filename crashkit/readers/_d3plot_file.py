@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.errors import ReadError
-from crashkit.readers._lasso import geometry_class, guarded, header_class
+from crashkit.readers.lasso import geometry_class, guarded, header_class
 
 _END = -999999.0
 _HEADER_WORDS = 64

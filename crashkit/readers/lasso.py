@@ -28,6 +28,15 @@ def header_class() -> Any:
 
 
 @cache
+def d3plot_class() -> Any:
+    """lasso-python's D3plot, which reads a whole family and writes one."""
+    _swallowed()
+    from lasso.dyna import D3plot
+
+    return D3plot
+
+
+@cache
 def geometry_class() -> Any:
     """lasso-python's D3plot for a geometry section in memory, with its loops bounded."""
     _swallowed()
