@@ -56,6 +56,7 @@ class Record:
     parameters  parameter -> its values in the runs it was fitted to, for marks on sliders
     left_out    run -> e2 (m) when it is left out of the training, of the finest level; and the deviation the process
                 then believes in, up to a factor (1 for a cascade). Empty where validation runs judged
+    numbers     name -> formula, unit, and the errors of a number on runs that were left out
     notes       what was unusual about the data
     """
 
@@ -75,6 +76,7 @@ class Record:
     physics: dict[str, Any] = field(default_factory=dict)
     parameters: dict[str, list[float]] = field(default_factory=dict)
     left_out: dict[str, tuple[float, float]] = field(default_factory=dict)
+    numbers: dict[str, dict[str, Any]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     @classmethod
@@ -131,6 +133,7 @@ def record_from_dict(values: Mapping[str, Any], histories: Mapping[int, dict[str
         physics=dict(values["physics"]),
         parameters={str(k): [float(x) for x in v] for k, v in values.get("parameters", {}).items()},
         left_out={str(k): (float(e), float(d)) for k, (e, d) in values.get("left_out", {}).items()},
+        numbers={str(k): dict(v) for k, v in values.get("numbers", {}).items()},
         notes=list(values["notes"]),
     )  # fmt: skip
 

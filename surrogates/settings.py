@@ -303,9 +303,12 @@ class Settings(_Frozen):
         Nodes without a displacement: `hold` the last displacement of each; `refuse` such runs; `auto`: hold if
         elements erode, else refuse.
     targets
-        What is learnt: `displacement`, and results on elements such as `plastic_strain` beside it.
+        What is learnt: `displacement`, and beside it results on elements such as `plastic_strain` and time histories such
+        as `history:wall_force_x` or `history:wall*`.
     removal
         Where elements erode, also how likely each is gone (`auto`), or not (`off`).
+    kpi
+        Name -> formula of numbers that are predicted, banded and rated: {intrusion: "max(displacement(part=box))"}.
     """
 
     model: ModelName = "mh"
@@ -325,15 +328,31 @@ class Settings(_Frozen):
     missing: Literal["auto", "hold", "refuse"] = "auto"
     targets: tuple[str, ...] = ("displacement",)
     removal: Literal["auto", "off"] = "auto"
+    kpi: Mapping[str, str] = {}
 
     @field_validator("removal", mode="before")
     @classmethod
     def _off(cls, value: Any) -> Any:
         return "off" if value is False else value  # YAML reads off as false
 
+    @field_validator("kpi", mode="before")
+    @classmethod
+    def _whole_formulas(cls, given: Any) -> Any:
+        """YAML parts {a: max(f(x, y))} at the comma: what follows comes as a name without a value, and belongs before it."""
+        if not isinstance(given, Mapping):
+            return given
+        out: dict[Any, Any] = {}
+        for name, text in given.items():
+            if text is None and out:
+                last = next(reversed(out))
+                out[last] = f"{out[last]}, {name}"
+            else:
+                out[name] = text
+        return out
+
     @model_validator(mode="after")
     def _fits_together(self) -> Settings:
-        if "displacement" not in self.targets:
+        if "displacement" not in self.targets and not any(t.startswith("history:") for t in self.targets):
             raise ValueError(
                 f"targets {', '.join(self.targets) or 'none'} lacks displacement, which everything else stands beside; "
                 f"expected such as displacement,plastic_strain"

@@ -15,6 +15,7 @@ from surrogates.data.graphs import Graphs
 from surrogates.data.inputs import over_range
 from surrogates.errors import SurrogateError
 from surrogates.local_errors import HARD, LocalErrors
+from surrogates.models.curves import Curve
 from surrogates.models.element_field import ElementField, faces_to_level
 from surrogates.models.pod_regression import PodRegression
 from surrogates.models.removal import Removal
@@ -55,6 +56,8 @@ class Surrogate:
         The levels it knows; with them predictions are lifted to the full mesh without the data.
     points, faces
         The full mesh (node, 3), m, and (face, corner), where the training data told them.
+    curves
+        Time histories that were learnt beside the displacements, by channel.
     labels
         The solver's numbers and names on it, where the training data told them.
     removal
@@ -80,6 +83,7 @@ class Surrogate:
         self.bands: dict[tuple[int, bool], Band] = {}
         self.removal: Removal | None = None
         self.fields: dict[str, ElementField] = {}
+        self.curves: dict[str, Curve] = {}
         self._upward: dict[int, sparse.csr_matrix] = {}
 
     @property
@@ -132,6 +136,23 @@ class Surrogate:
         if isinstance(core, PodRegression):
             return self.registration.undo(lambda x, t: core.displacement(x, t, number, nodes), values, times)
         return np.asarray(self.predict_full(values, times, number)[:, :, nodes])
+
+    def predict_curve(self, name: str, parameters: ArrayLike) -> NDArray[np.float64]:
+        """A channel of the histories: (sample,), or (batch, sample), in its unit at the times of `curves[name]`.
+
+        Raises
+        ------
+        SurrogateError
+            For a channel that was no target of the training.
+        """
+        if name not in self.curves:
+            has = ", ".join(self.curves) or "none"
+            raise SurrogateError(
+                f"{name} was not learnt, of histories there is {has}; train with --targets history:{name}"
+            )
+        values, _ = self.checked(parameters, None)
+        out = self.curves[name].predict(self.registration, values)
+        return np.asarray(out[0] if np.ndim(parameters) == 1 else out)
 
     def lift(self, states: NDArray[np.float32], level: int) -> NDArray[np.float32]:
         """(..., node of `level`, 3) -> (..., node of the full mesh, 3)"""

@@ -91,7 +91,7 @@ def open_campaign(
     from crashkit.selection import runs_of
     from data_schema import fields, parameters, table_unit
     from data_schema.dimensions import dimension
-    from surrogates.data.campaign import Campaign, ElementTarget
+    from surrogates.data.campaign import Campaign, CurveTarget, ElementTarget
 
     with source.opened() as opened, reading_dataset(source.name):
         on_faces = [
@@ -104,6 +104,7 @@ def open_campaign(
         unread = [n for n in ("displacement", "alive", "cell_alive", "history") if n in opened]
         dataset = opened.drop_vars([*unread, *fields(opened)]).load()
         states, nodes = opened.sizes["time"], opened.sizes["node"]
+        curve_time, channels = histories(opened)
     runs = [str(n) for n in dataset["sim"].values]
     held_out = [] if test is None else runs_of(runs, test)
     chosen = [k for k in range(len(runs)) if k not in set(held_out)]
@@ -150,6 +151,8 @@ def open_campaign(
         targets=tuple(
             ElementTarget(name, unit, ElementValues(source, name, chosen, per_element)) for name, unit in on_faces
         ),
+        curves=tuple(CurveTarget(n, u, values[chosen]) for n, u, values in channels),
+        curve_time=curve_time,
         points=np.asarray((at.isel(sim=0) if "sim" in at.dims else at).values, np.float64),
         faces=dataset["face_nodes"].values.astype(np.int32),
         labels=labels_of(dataset),
@@ -157,6 +160,36 @@ def open_campaign(
         dimensions=tuple(dimension(str(dataset[n].attrs.get("units", ""))) for n in names),
         mirrors=_mirrors(dataset) if symmetry and (two_sided or odd) else (),
     )
+
+
+def histories(dataset: xr.Dataset) -> tuple[NDArray[np.float64] | None, list[tuple[str, str, NDArray[np.float64]]]]:
+    """Times (sample,), s, that runs share, and of each channel its name, unit and values (sim, sample); NaN behind a run's end.
+
+    Runs that were sampled at other times than the first are interpolated.
+    """
+    import numpy as np
+
+    if "history" not in dataset:
+        return None, []
+    values = dataset["history"].transpose("sim", "sample", "channel").values.astype(np.float64)
+    times = dataset["history_time"].values.astype(np.float64)
+    ends = np.nanmax(times, axis=1)
+    longest = times[int(np.argmax(np.isfinite(times).sum(axis=1)))]
+    time = longest[np.isfinite(longest)]
+    time = time[time <= float(np.median(ends)) * (1 + 1e-6)]
+    out = np.full((len(values), len(time), values.shape[2]), np.nan)
+    # The last samples of runs of one length differ by less than a time step.
+    slack = np.diff(time).max() if len(time) > 1 else 0.0
+    for run, (mine, curves) in enumerate(zip(times, values, strict=True)):
+        there = np.isfinite(mine)
+        for k in range(values.shape[2]):
+            known = there & np.isfinite(curves[:, k])
+            if known.any():
+                out[run, :, k] = np.interp(time, mine[known], curves[known, k])
+                out[run, time > mine[known].max() + slack, k] = np.nan
+    names = [str(n) for n in dataset["channel"].values]
+    units = [str(u) for u in dataset["channel_unit"].values] if "channel_unit" in dataset else [""] * len(names)
+    return time, [(n, u, out[:, :, k]) for k, (n, u) in enumerate(zip(names, units, strict=True))]
 
 
 def labels_of(dataset: xr.Dataset) -> Labels:

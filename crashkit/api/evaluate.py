@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from crashkit.mesh.levels import Hierarchy
     from crashkit.selection import WhichRuns
     from data_schema.levels import Level
+    from evaluation.comparison.beside import Beside
     from evaluation.comparison.predictor import Model
     from evaluation.comparison.reference import Reference
     from evaluation.comparison.result import Evaluation
@@ -146,6 +147,7 @@ def evaluate(
             reference, stored, split, seeds_as_spread=seeds_as_spread, pods=pods, scored=[scored[k] for k in sorted(scored)],
             sensors=sensors, context=_context(Path(source.name), reference, stored, split),
         )  # fmt: skip
+        result = dataclasses.replace(result, beside=_beside(source, result, tell))
         if formats:
             runs = default_runs(result) if shown_runs is None else shown_runs
             with _counted(tell, "runs for ParaView", len(runs)) as step:
@@ -183,6 +185,71 @@ def _note_bands(asked: Sequence[tuple[str, Trained | Path]], result: Evaluation)
         folder = given if isinstance(given, Path) else given.folder
         if folder is not None:
             note_held(folder, held)
+
+
+def _beside(source: Source, result: Evaluation, tell: Progress) -> Beside | None:
+    """Histories and numbers of the models that have any, on their finest level, against the truth."""
+    import numpy as np
+
+    from crashkit.api._predicted import GivenRuns, Structure
+    from crashkit.api.campaign import histories
+    from crashkit.api.numbers import half_width, model_formulas, predicted_numbers
+    from evaluation.comparison.beside import SHARE, Beside, CurveCompared, NumberCompared
+    from evaluation.measures.formula import Value
+
+    asked: dict[str, StoredLevel] = {}
+    for entry in result.entries:
+        one = result.predictor(entry)
+        if not isinstance(one, StoredLevel) or one.level != one.surrogate.number(None):
+            continue
+        if one.surrogate.curves or one.surrogate.record.numbers:
+            asked[entry.label] = one
+    if not asked:
+        return None
+    test, reference = list(result.split.test), result.reference
+    with source.opened() as opened:
+        time, channels = histories(opened)
+    true_curves = {name: (unit, values[test]) for name, unit, values in channels}
+    parameters = {label: reference.parameters[test][:, list(one.order)] for label, one in asked.items()}
+    numbers: dict[tuple[str, str, str], tuple[Any, dict[str, Any], dict[str, float]]] = {}
+    for label, one in asked.items():
+        formulas, structure = model_formulas(one.surrogate), Structure.of(one.surrogate)
+        said = [predicted_numbers(one.surrogate, p[None]) for p in parameters[label]]
+        for k, (name, formula) in enumerate(formulas.items()):
+            key = (name, formula.text, said[0][k].unit)
+            if key not in numbers:
+                truth = np.full(len(test), np.nan)
+                for place, run in enumerate(test):
+                    tell("numbers of the test runs", place + 1, len(test), name)
+                    curves = {
+                        c: Value(values[place : place + 1], ("time",), time, unit or "1")
+                        for c, (unit, values) in true_curves.items()
+                    }
+                    own, states = parameters[label][place : place + 1], reference.displacement(run)[None]
+                    true = GivenRuns(structure, own, reference.time, states, curves)
+                    truth[place] = float(np.asarray(formula.number(true, formulas).array).ravel()[0])
+                numbers[key] = (truth, {}, {})
+            errors = list(one.surrogate.record.numbers[name]["errors"].values())
+            width = half_width(errors, SHARE)
+            numbers[key][1][label] = np.array([float(found[k].values[0]) for found in said])
+            numbers[key][2][label] = float("nan") if width is None else width
+    curves_compared = []
+    for name, (unit, truth) in true_curves.items():
+        having = {label: one.surrogate for label, one in asked.items() if name in one.surrogate.curves}
+        if not having or time is None:
+            continue
+        predictions, widths = {}, {}
+        for label, surrogate in having.items():
+            curve = surrogate.curves[name]
+            said_curves = surrogate.predict_curve(name, parameters[label])
+            predictions[label] = np.stack([np.interp(time, curve.time, c) for c in said_curves])
+            width_known = curve.band is not None
+            widths[label] = (
+                np.interp(time, curve.time, curve.half_width(SHARE)) if width_known else np.full(len(time), np.nan)
+            )
+        curves_compared.append(CurveCompared(name, unit, time, truth, predictions, widths))
+    compared = tuple(NumberCompared(*key, *found) for key, found in numbers.items())
+    return Beside(result.test_names, compared, tuple(curves_compared))
 
 
 def _folder(output: str | Path | None) -> contextlib.AbstractContextManager[Path]:

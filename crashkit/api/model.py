@@ -100,7 +100,9 @@ class Model:
         Returns
         -------
         xarray.Dataset
-            `displacement` (time, node, xyz), m, with `sim` in front for several runs; the parameters; and the mesh, so
+            `displacement` (time, node, xyz), m, with `sim` in front for several runs; `history` (sample, channel) of the
+            channels that were targets of the training, and the numbers of the settings' `kpi`; with `band` also
+            `history_half_width` and NAME_half_width; the parameters; and the mesh, so
             that `prediction.crash.to_pyvista(time=0.02).plot()` draws it. Also the results on elements (time, face) that
             were among the targets, and on the full mesh `removal_probability` (time, face) where training runs lost
             elements. The coordinate `node` says which node of the full mesh each one is. Attributes: `model`, `level`,
@@ -173,6 +175,8 @@ class Model:
                         zip(ranges.names, ranges.units, ranges.written, strict=True)
                     )
                 },
+                **self._histories(values, band),
+                **self._numbers(values, band, number),
                 **self._mesh(0 if full else number),
             },
             coords={
@@ -294,6 +298,37 @@ class Model:
             states = states.isel(node=graphs.kept(number))
         flat = np.asarray(states.values, np.float32).reshape(-1, *states.shape[-2:])
         return flat, states
+
+    def _histories(self, values: NDArray[np.float64], band: float | None) -> dict[str, Any]:
+        """Histories that were learnt, as variables of a dataset."""
+        import numpy as np
+
+        curves = self.surrogate.curves
+        if not curves:
+            return {}
+        said = [self.surrogate.predict_curve(name, values) for name in curves]
+        out: dict[str, Any] = {
+            "history": (("sim", "sample", "channel"), np.stack(said, axis=-1)),
+            "history_time": ("sample", next(iter(curves.values())).time, {"units": "s"}),
+            "channel": ("channel", list(curves)),
+            "channel_unit": ("channel", [curve.unit for curve in curves.values()]),
+        }
+        if band is not None and all(curve.band is not None for curve in curves.values()):
+            widths = np.stack([curve.half_width(band) for curve in curves.values()], axis=-1)
+            out["history_half_width"] = (("sample", "channel"), widths)
+        return out
+
+    def _numbers(self, values: NDArray[np.float64], band: float | None, level: int) -> dict[str, Any]:
+        """Numbers by formula of the settings, as variables of a dataset."""
+        from crashkit.api.numbers import predicted_numbers
+
+        out: dict[str, Any] = {}
+        for found in predicted_numbers(self.surrogate, values, band, level):
+            attributes = {"units": found.unit, "role": "number"}
+            out[found.name] = ("sim", found.values, attributes)
+            if found.half_width is not None:
+                out[f"{found.name}_half_width"] = ((), found.half_width, attributes)
+        return out
 
     def _mesh(self, level: int) -> dict[str, Any]:
         """The mesh of a level as variables of a dataset; nothing where the model was stored without."""

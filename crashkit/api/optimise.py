@@ -147,6 +147,7 @@ def optimise(
     """
     from crashkit.api._predicted import PredictedRuns, Structure
     from crashkit.api.invert import known_values
+    from crashkit.api.numbers import model_formulas
     from crashkit.api.predict import model_in_hand
     from crashkit.errors import DataError
     from evaluation.measures.formula import read_formula, read_formulas, read_limit
@@ -158,12 +159,13 @@ def optimise(
         raise DataError(f"confidence {confidence}: expected a share from 0.5 to below 1, such as 0.9")
     tell = watched(report, progress)
     surrogate = model_in_hand(model).surrogate
-    ranges, structure, number = surrogate.record.ranges, Structure(surrogate), surrogate.number(level)
-    formulas = read_formulas(dict(numbers or {}))
+    ranges, structure, number = surrogate.record.ranges, Structure.of(surrogate), surrogate.number(level)
+    formulas = read_formulas({**{n: f.text for n, f in model_formulas(surrogate).items()}, **(numbers or {})})
     text = str(minimise if maximise is None else maximise).strip()
     goal = formulas.get(text) or read_formula(text)
     bounds = [read_limit(t, formulas) for t in ([subject_to] if isinstance(subject_to, str) else subject_to)]
-    _all_known([goal, *(b.formula for b in bounds)], formulas, ranges.names)
+    curves = [*surrogate.curves, *(name[:-2] for name in surrogate.curves if name[-2:] in ("_x", "_y", "_z"))]
+    _all_known([goal, *(b.formula for b in bounds)], formulas, [*ranges.names, *curves])
     low, high = ranges.low.copy(), ranges.high.copy()
     for name, given in known_values(known or {}, surrogate).items():
         low[ranges.names.index(name)] = high[ranges.names.index(name)] = given
@@ -173,7 +175,7 @@ def optimise(
     time = surrogate.record.time
 
     def asked(points: Floats) -> PredictedRuns:
-        return PredictedRuns(structure, points, time, number)
+        return PredictedRuns(surrogate, structure, points, time, number)
 
     def numbers_of(predicted: PredictedRuns, count: int) -> Floats:
         values = [sign * goal.number(predicted, formulas).array]
@@ -266,8 +268,9 @@ def _errors(
     if doubt is None:
         return "", np.zeros((1, len(best.excess)))
     runs = asked(best.parameters[None])
+    shares = np.random.default_rng(seed + 1).uniform(-0.99, 0.99, _DRAWS)  # quantiles of the errors of histories
     draws = [
-        numbers_of(runs.with_error(lambda nodes, w=which: doubt.draw(w, slice(0, 1), nodes)), 1)[0, 1:]
+        numbers_of(runs.wrong_by(lambda nodes, w=which: doubt.draw(w, slice(0, 1), nodes), shares[which]), 1)[0, 1:]
         for which in range(_DRAWS)
     ]
     return doubt.told, np.array(draws) - best.excess

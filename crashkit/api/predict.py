@@ -192,7 +192,10 @@ def write_prediction(
             raise DataError(f"{output}: holds one state, and {states} were asked for; choose one with --time, or .pvd")
         return write_run(prediction, output, {"model": str(prediction.attrs["model"]), **(about or {})})
     names = ["displacement", "reference_position", "node_id", "predicted", "error"]
-    names += [str(n) for n, v in prediction.data_vars.items() if v.attrs.get("role") in ("field", "parameter")]
+    names += ["history", "history_time", "channel", "history_half_width"]
+    names += [
+        str(n) for n, v in prediction.data_vars.items() if v.attrs.get("role") in ("field", "parameter", "number")
+    ]
     arrays = {n: prediction[n].values for n in dict.fromkeys(["node", *names]) if n in prediction.variables}
     try:
         with beside(output) as new, new.open("wb") as file:

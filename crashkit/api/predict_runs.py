@@ -74,6 +74,8 @@ class PredictedRun:
     expected_removed, hidden
         Elements that are gone in the last state: the sum of their probabilities, and how many are hidden; None where
         nothing is said of them.
+    numbers
+        Name -> value, unit and half_width (with a band) of each number by formula; None without any.
     """
 
     run: str
@@ -91,6 +93,7 @@ class PredictedRun:
     band: PredictedBand | None = None
     expected_removed: float | None = None
     hidden: int | None = None
+    numbers: dict[str, dict[str, Any]] | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """As plain values, without those that are None."""
@@ -349,5 +352,17 @@ def _predicted(
         warnings=sentences,
         expected_removed=None if last is None else float(last.sum()),
         hidden=None if last is None else int((last > hide_above).sum()),
+        numbers=_numbers(prediction),
         **errors,
     )
+
+
+def _numbers(prediction: xr.Dataset) -> dict[str, dict[str, Any]] | None:
+    of_role = [str(n) for n, v in prediction.data_vars.items() if v.attrs.get("role") == "number"]
+    names = [n for n in of_role if n.removesuffix("_half_width") not in of_role or not n.endswith("_half_width")]
+    out: dict[str, dict[str, Any]] = {}
+    for name in names:
+        out[name] = {"value": float(prediction[name]), "unit": str(prediction[name].attrs["units"])}
+        if f"{name}_half_width" in of_role:
+            out[name]["half_width"] = float(prediction[f"{name}_half_width"])
+    return out or None

@@ -102,6 +102,7 @@ def scatter(
 
     need("a scatter", "train", "report")
     from crashkit.api._predicted import Structure
+    from crashkit.api.numbers import model_formulas
     from crashkit.api.predict import model_in_hand
     from crashkit.output import complete_folder, refuse_earlier
     from evaluation.measures.formula import read_formulas, read_limit
@@ -112,12 +113,13 @@ def scatter(
     tell = watched(report, progress)
     trained = model_in_hand(model)
     surrogate = trained.surrogate
-    structure = Structure(surrogate)
+    structure = Structure.of(surrogate)
     number = surrogate.number(level)
     nominal, scatters = _scatters(surrogate.record.ranges, vary, at or {}, shape)
-    formulas = read_formulas({_LARGEST: "max(displacement())", **(numbers or {})})
+    known = {name: formula.text for name, formula in model_formulas(surrogate).items()}
+    formulas = read_formulas({_LARGEST: "max(displacement())", **known, **(numbers or {})})
     bounds = [read_limit(text, formulas) for text in limits]
-    study = _Study(structure, nominal, scatters, formulas, bounds, number, seed, tell)
+    study = _Study(surrogate, structure, nominal, scatters, formulas, bounds, number, seed, tell)
     study.check()
     result = study.result(draw(scatters, draws, seed, plan), confidence)
     result = _described(result, trained, plan, seed, level)
@@ -132,6 +134,7 @@ class _Study:
 
     def __init__(
         self,
+        surrogate: Surrogate,
         structure: Structure,
         nominal: Floats,
         scatters: Sequence[Scatter],
@@ -143,7 +146,7 @@ class _Study:
     ) -> None:
         self.structure, self.nominal, self.scatters = structure, nominal, tuple(scatters)
         self.formulas, self.bounds, self.level, self.seed, self.tell = formulas, bounds, level, seed, tell
-        self.surrogate = structure.surrogate
+        self.surrogate = surrogate
         self.time = self.surrogate.record.time
         names = self.surrogate.record.ranges.names
         self.columns = [names.index(one.name) for one in self.scatters]
@@ -153,7 +156,7 @@ class _Study:
     def runs(self, parameters: Floats, states: NDArray[np.floating] | None = None) -> Any:
         from crashkit.api._predicted import PredictedRuns
 
-        return PredictedRuns(self.structure, parameters, self.time, self.level, states)
+        return PredictedRuns(self.surrogate, self.structure, parameters, self.time, self.level, states)
 
     def full(self, draws: Floats) -> Floats:
         """(draw, parameter that scatters) -> (draw, parameter of the model)."""
@@ -275,13 +278,14 @@ class _Study:
             return "", None, None
         again = np.empty((len(self.bounds), _MODELS, len(some)), bool)
         as_is = np.empty((len(self.bounds), len(some)), bool)
+        shares = np.random.default_rng(self.seed + 3).uniform(-0.99, 0.99, _MODELS)
         what = "draws with the model's doubt"
         for begin in range(0, len(some), self.rows):
             rows = slice(begin, min(begin + self.rows, len(some)))
             runs = self.runs(some[rows])
             as_is[:, rows] = self.broken(runs)
             for which in range(_MODELS):
-                wrong = runs.with_error(lambda nodes, w=which, r=rows: doubt.draw(w, r, nodes))
+                wrong = runs.wrong_by(lambda nodes, w=which, r=rows: doubt.draw(w, r, nodes), shares[which])
                 again[:, which, rows] = self.broken(wrong)
             self.tell(what, rows.stop, len(some), "")
         return doubt.told, again, as_is

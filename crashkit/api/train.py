@@ -34,6 +34,7 @@ def train(
     seed: int | None = None,
     epochs: int | None = None,
     test: WhichRuns | None = None,
+    targets: Sequence[str] = (),
     hierarchy: Hierarchy | None = None,
     device: str = "auto",
     resume: bool = False,
@@ -67,6 +68,8 @@ def train(
         Random seed, and epochs of every level; over all of the above.
     test
         Runs held out for testing: "27:36", names, a number or a fraction (drawn at random, seeded).
+    targets
+        What is learnt beside the displacements: "history:wall_force", a channel, a pattern, or the name of a resultant.
     hierarchy
         Mesh hierarchy of a dataset in memory, as `crashkit.coarsen(dataset)` returns it. A dataset on disk has its own.
     device
@@ -107,6 +110,7 @@ def train(
     need("training a model", "train")
     from crashkit.api.campaign import open_campaign
     from crashkit.api.model import Model
+    from crashkit.api.numbers import NumberJudge
     from crashkit.api.source import source_of
     from crashkit.output import check_model_folder
     from surrogates.errors import SurrogateError
@@ -118,6 +122,8 @@ def train(
 
     given: dict[str, Any] = {} if seed is None else {"seed": seed}
     given |= {} if epochs is None else {"level.epochs": epochs, "transfer.epochs": 1}
+    if targets:
+        given["targets"] = list(dict.fromkeys(["displacement", *targets]))
     chosen = all_settings(model, preset, config, [settings, given])
     folder = None if output is None else Path(output)
     if folder is not None:
@@ -127,6 +133,7 @@ def train(
     symmetry = chosen.model in ("mh", "podnn", "pod-gpr", "pod-rbf") and chosen.physics.symmetry == "auto"
     odd = chosen.physics.odd or ()
     campaign = open_campaign(source_of(dataset, hierarchy), test, symmetry=symmetry, odd=odd)
+    judge = NumberJudge.of(chosen, campaign)
     state = None if folder is None else folder.with_name(f".{folder.name}.training")
     with (
         tempfile.TemporaryDirectory(prefix="crashkit-") as scratch,
@@ -151,7 +158,9 @@ def train(
             keeper.discard()
             return Model(rescued, folder)
         try:
-            surrogate = train_surrogate(campaign, chosen, device=device, report=tell, keeper=keeper)
+            surrogate = train_surrogate(campaign, chosen, device=device, report=tell, keeper=keeper, watch=judge)
+            if judge is not None and surrogate.core.numbers:
+                judge.note(surrogate)
         except SurrogateError as error:
             if first and folder is not None and isinstance(error, Diverged) and error.surrogate is not None:
                 save(error.surrogate, folder, overwrite=overwrite)

@@ -133,6 +133,9 @@ def show(rows: list[PredictedRun]) -> None:
         )
     if first.band is not None:
         _show_band(first.band)
+    if len(rows) == 1 and first.numbers:
+        for name, found in first.numbers.items():
+            say(f"{name}: {_readable(found['value'], found['unit'], found.get('half_width'))}")
     look_in_paraview(first.files)
 
 
@@ -163,3 +166,14 @@ def _times(text: str) -> list[float] | None:
     if any(b <= a for a, b in itertools.pairwise(times)):
         raise typer.BadParameter(f"{text!r}; expected increasing times, each once", param_hint="--time")
     return times or None
+
+
+def _readable(value: float, unit: str, half_width: float | None) -> str:
+    """A number in the unit that people read, with its band."""
+    import numpy as np
+
+    from evaluation.drawing.style import readable
+
+    shown, name = readable(np.array([value, half_width or 0.0]), unit)
+    band = "" if half_width is None else f" ± {shown[1]:.3g}"
+    return f"{shown[0]:.4g}{band} {name}".rstrip()

@@ -10,7 +10,7 @@ import typer
 
 from crashkit.api.describe import describe_training, middle, trained_levels, what_is_said_of_elements, what_was_chosen
 from crashkit.api.train import interrupted, left_behind, train
-from crashkit.cli._console import fixed, print_json, say, table, what_next
+from crashkit.cli._console import fixed, names, print_json, say, table, what_next
 from crashkit.cli._progress import Progress
 
 if TYPE_CHECKING:
@@ -42,7 +42,9 @@ def command(
     ] = "",
     targets: Annotated[
         str,
-        typer.Option(help="What is learnt, such as displacement,plastic_strain: also results on elements."),
+        typer.Option(
+            help="What is learnt: displacement, and beside it results on elements (plastic_strain) and histories (history:wall_force)."
+        ),
     ] = "displacement",
     epochs: Annotated[
         int | None, typer.Option(help="Epochs of every level.", min=1, show_default="from the settings")
@@ -59,8 +61,6 @@ def command(
     given = list(settings or ())
     if odd:
         given.append(f"physics.odd=[{odd}]")
-    if targets != "displacement":
-        given.append(f"targets=[{targets}]")
     if not json:
         for left in left_behind(output, resume=resume):
             say(f"note: {left}")
@@ -68,6 +68,7 @@ def command(
         surrogate = train(
             dataset, output, model or None, preset=preset or None, settings=given, config=config, seed=seed,
             epochs=epochs, test=test or None, device=device, resume=resume, overwrite=overwrite,
+            targets=() if targets == "displacement" else names(targets),
             tensorboard=tensorboard, on_epoch=epoch_lines(shown, verbose),
         ).surrogate  # fmt: skip
     if json:
@@ -101,6 +102,9 @@ def epoch_lines(shown: Progress, verbose: bool = False) -> Callable[[Epoch], Non
 
 def show(surrogate: Surrogate, output: Path) -> None:
     """What was trained and how well it does on validation runs."""
+    from crashkit.api.numbers import told_beside
+    from evaluation.report.page import plain
+
     record = surrogate.record
     for text in record.notes:
         say(f"note: {text}")
@@ -116,5 +120,12 @@ def show(surrogate: Surrogate, output: Path) -> None:
             for r in trained_levels(surrogate)
         ),
     )  # fmt: skip
+    beside = told_beside(surrogate)
+    if beside:
+        table(
+            "Beside the displacements: errors on runs that were left out",
+            ("what", "unit", "runs", "mean error", "typical value"),
+            ((r["name"], r["unit"], r["runs"], plain(r["error"]), plain(r["size"])) for r in beside),
+        )
     for line in [*what_was_chosen(record), *what_is_said_of_elements(surrogate)]:
         say(line)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from crashkit.display import Described, Facts, Rows, listed
 from data_schema.pod import Pod, StreamedPod
+from evaluation.comparison.beside import Beside
 from evaluation.comparison.predictor import Model, Predictor
 from evaluation.comparison.reference import Reference
 from evaluation.comparison.scoring import Key, RunScores, Scores, full_field, gather, mesh_of, score_run
@@ -53,6 +54,8 @@ class Evaluation(Described):
         Where histories were taken; None without.
     files
         ParaView files written of it (evaluation.report.files.write_run).
+    beside
+        Histories and numbers by formula; None where no model has any.
     """
 
     reference: Reference
@@ -67,6 +70,7 @@ class Evaluation(Described):
     context: Mapping[str, str] = field(default_factory=dict)
     sensors: Sensors | None = None
     files: tuple[Path, ...] = ()
+    beside: Beside | None = None
 
     def _facts(self) -> tuple[str, Facts, Sequence[str], Rows]:
         rows = []

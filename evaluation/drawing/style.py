@@ -145,6 +145,8 @@ def readable(values: NDArray[np.float64], unit: str) -> tuple[NDArray[np.float64
     largest = float(np.abs(values).max(initial=0.0))
     if unit == "Pa" and largest >= 1e5:
         return values * 1e-6, "MPa"
+    if unit in ("N", "J", "W") and largest >= 1e4:
+        return values * 1e-3, f"k{unit}"
     if unit == "m" and 0 < largest < 0.02:
         return values * 1e3, "mm"
     return values, {"m s-1": "m/s", "degree": "°", "1": ""}.get(unit, unit)

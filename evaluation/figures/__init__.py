@@ -37,6 +37,8 @@ ORDER = (
     "part_intrusion",
     "removal",
     "element_fields",
+    "numbers",
+    "histories",
     "probes",
     "ratings",
     "levels",

@@ -113,7 +113,7 @@ def rate_curves(
     """
     if len(time) < 4:
         return None
-    _keep_compiled()
+    keep_compiled()
     true_curves = [curves(time, u) for u in truths]
     quantities = true_curves[0].quantities if true_curves else ()
     out = {}
@@ -130,7 +130,7 @@ def rate_curves(
     return Ratings(quantities, true_curves[0].cfc, out)
 
 
-def _keep_compiled() -> None:
+def keep_compiled() -> None:
     """Let numba keep on disk the two loops of the ratings' time warping, which every process would else compile anew
     for longer than it takes to rate a campaign. Where there is no place for it, they are compiled as before."""
     for module, name in (("dtwalign.cost", "_calc_cumsum_matrix_jit"), ("dtwalign.backtrack", "_backtrack_jit")):

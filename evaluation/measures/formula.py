@@ -429,7 +429,7 @@ class _Walk:
             return found
         parts = [self.runs.named(f"{name}_{axis}") for axis in AXES]
         there = [p for p in parts if p is not None]
-        if len(there) > 1 and all(p.axes == ("time",) for p in there):  # a resultant of its components
+        if there and all(p.axes == ("time",) for p in there):  # a resultant of its components
             squares = [np.square(np.asarray(p.array, np.float64)) for p in there]
             return Value(np.sqrt(np.sum(squares, axis=0)), ("time",), there[0].time, there[0].unit)
         known = ", ".join([*self.others, *self.runs.names][:16]) or "none"

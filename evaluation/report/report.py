@@ -104,6 +104,7 @@ def write_report(
         "runs": tables.of_runs(evaluation),
         "worst": tables.worst_places(evaluation),
         **_ratings(evaluation),
+        **({} if evaluation.beside is None else {"numbers": evaluation.beside.table()}),
         "split": tables.split(evaluation),
         **_worth(evaluation),
     }
@@ -224,6 +225,17 @@ def _tables(performance: Columns, all_tables: Mapping[str, Columns]) -> list[Sho
                 )
             ]
             if "ratings" in all_tables
+            else []
+        ),
+        *(
+            [
+                show_table(
+                    "Numbers and histories",
+                    all_tables["numbers"],
+                    "Numbers by formula and time histories, in SI units: mean over the test runs; ratings after ISO/TS 18571.",
+                )
+            ]
+            if "numbers" in all_tables
             else []
         ),
         *(

@@ -54,6 +54,23 @@ class Labels:
 
 
 @dataclass(frozen=True)
+class CurveTarget:
+    """A channel of the time histories that is learnt beside the displacements.
+
+    Attributes
+    ----------
+    name, unit
+        Of the channel.
+    values
+        (sim, sample), NaN where a run lacks it.
+    """
+
+    name: str
+    unit: str
+    values: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
 class Campaign:
     """The runs a surrogate may see, and nothing of the test runs.
 
@@ -96,6 +113,8 @@ class Campaign:
         (sim, state, face) whether an element is still there, taken run by run; None where none disappears.
     targets
         Results on elements that are learnt beside the displacements.
+    curves, curve_time
+        Channels of time histories that are learnt beside the displacements, and their times (sample,), s.
     known
         (sim, state) whether a run was computed that far; None: all were. Other states are in no loss.
     """
@@ -123,3 +142,5 @@ class Campaign:
     marked: Mapping[str, str] | None = None
     alive: RunByRun | None = None
     targets: tuple[ElementTarget, ...] = ()
+    curves: tuple[CurveTarget, ...] = ()
+    curve_time: NDArray[np.float64] | None = None

@@ -16,6 +16,7 @@ from scipy import sparse
 from surrogates.data.campaign import Labels
 from surrogates.data.graphs import Graphs
 from surrogates.errors import SurrogateError
+from surrogates.models.curves import Curve
 from surrogates.models.element_field import ElementField
 from surrogates.models.pod_regression import PodRegression
 from surrogates.models.removal import Removal
@@ -128,6 +129,26 @@ def check_labels(labels: Labels | None, n_nodes: int, n_faces: int) -> None:
     numbers("face_part", labels.face_part, (n_faces,), 0, parts)
     if labels.face_id is not None:
         numbers("face_id", labels.face_id, (n_faces,))
+
+
+def check_curves(curves: Mapping[str, Curve]) -> None:
+    """Components, values and times of each channel fit together."""
+    for name, curve in curves.items():
+        samples, places = (
+            len(numbers(f"time of {name}", curve.time, (None,))),
+            len(numbers("grid", curve.grid, (None,))),
+        )
+        modes = numbers(f"modes of {name}", curve.modes, (None, places))
+        values = numbers(f"values of {name}", curve.values, (None, len(modes)))
+        inputs = len(numbers("low", curve.low, (None,)))
+        numbers("high", curve.high, (inputs,))
+        numbers(f"inputs of {name}", curve.machine.x, (len(values), None))
+        if not samples or (np.diff(curve.time) <= 0).any() or (np.diff(curve.grid) <= 0).any():
+            raise SurrogateError(f"times of {name} are not increasing")
+        if curve.band is not None:
+            numbers("node", curve.band.node, (1,))
+            numbers("state", curve.band.state, (samples,))
+            numbers("factor", curve.band.factor, (len(SHARES),))
 
 
 def check_bands(bands: Mapping[tuple[int, bool], Band], graphs: Graphs, record: Record) -> None:

@@ -5,6 +5,7 @@
     graphs.safetensors     the levels' graphs and maps, and the full mesh, so that it lifts and draws without the data
     elements.safetensors   what is said of elements: their removal, plastic strain and the like; where there is any
     bands.safetensors      how far predictions may be wrong, from the validation runs
+    curves.safetensors     time histories, where they were learnt
     history.json           losses by epoch and level
     card.md                for people
 
@@ -32,6 +33,7 @@ from surrogates.data.campaign import Labels
 from surrogates.data.graphs import Graphs
 from surrogates.errors import ModelFolderError, SurrogateError
 from surrogates.local_errors import LocalErrors
+from surrogates.models.curves import Curve
 from surrogates.models.element_field import ElementField
 from surrogates.models.pod_regression import PodRegression
 from surrogates.models.removal import Removal, Score
@@ -42,6 +44,7 @@ from surrogates.storage.card import card
 from surrogates.storage.checks import (
     check_bands,
     check_core,
+    check_curves,
     check_elements,
     check_graphs,
     check_labels,
@@ -58,6 +61,7 @@ FORMAT = 2
 _MAIN = "model.json"
 _ELEMENTS = "elements.safetensors"
 _SPREADS: tuple[Spread, ...] = ("constant", "size", "deviation", "local")
+_CURVES = "curves.safetensors"
 _LABELS = ("node_id", "face_part", "part_id", "face_id")
 
 
@@ -123,6 +127,8 @@ def load(folder: str | Path) -> Surrogate:
         bands = _bands(load_file(folder / "bands.safetensors"), record)
         labels = _labels(stored, about)
         check_bands(bands, graphs, record)
+        curves = _curves(load_file(folder / _CURVES) if _CURVES in files else {}, about.get("curves", {}))
+        check_curves(curves)
         check_labels(labels, graphs.n_full, 0 if faces is None else len(faces))
         check_core(core, graphs)
         tensors = load_file(folder / _ELEMENTS) if _ELEMENTS in files else {}
@@ -139,6 +145,7 @@ def load(folder: str | Path) -> Surrogate:
     surrogate.bands = bands
     surrogate.labels = labels
     surrogate.removal, surrogate.fields = elements
+    surrogate.curves = curves
     return surrogate
 
 
@@ -155,6 +162,9 @@ def _write(surrogate: Surrogate, folder: Path) -> None:
     save_file(_band_arrays(surrogate), folder / "bands.safetensors")
     if surrogate.removal is not None or surrogate.fields:
         save_file(_element_arrays(surrogate), folder / _ELEMENTS)
+    if surrogate.curves:
+        arrays = {f"{name}/{k}": v for name, curve in surrogate.curves.items() for k, v in curve.arrays().items()}
+        save_file({k: np.array(v, order="C") for k, v in arrays.items()}, folder / _CURVES)
     histories = {str(k): {n: _plain(v) for n, v in f.history.items()} for k, f in record.fits.items()}
     (folder / "history.json").write_text(json.dumps(histories), encoding="utf-8")
     (folder / "card.md").write_text(card(surrogate), encoding="utf-8")
@@ -176,6 +186,7 @@ def _write(surrogate: Surrogate, folder: Path) -> None:
             }
             for name, k in surrogate.level_names.items()
         ],
+        "curves": _plain({name: curve.told() for name, curve in surrogate.curves.items()}),
         "parts": [] if surrogate.labels is None else list(surrogate.labels.part_name),
         "elements": _plain(_about_elements(surrogate)),
         "files": {path.name: _sha256_of(path) for path in sorted(folder.iterdir())},
@@ -299,6 +310,15 @@ def _labels(stored: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> Lab
         return None
     arrays = {name: stored[name] for name in _LABELS if name in stored}
     return Labels(**arrays, part_name=tuple(map(str, about["parts"])))
+
+
+def _curves(stored: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> dict[str, Curve]:
+    out = {}
+    for name, told in about.items():
+        arrays = {k.removeprefix(f"{name}/"): v for k, v in stored.items() if k.startswith(f"{name}/")}
+        known = {**told, "errors": {k: float("nan") if v is None else v for k, v in told["errors"].items()}}
+        out[str(name)] = Curve.load(str(name), known, arrays)
+    return out
 
 
 def _band_arrays(surrogate: Surrogate) -> dict[str, NDArray[Any]]:

@@ -19,7 +19,7 @@ def check_targets(campaign: Campaign, settings: Settings) -> None:
     """Raise SurrogateError for a target that the campaign does not hold."""
     known = [t.name for t in campaign.targets]
     for name in settings.targets:
-        if name != "displacement" and name not in known:
+        if name != "displacement" and not name.startswith("history:") and name not in known:
             raise SurrogateError(
                 f"targets names {name!r}, and the dataset has {', '.join(known) or 'no result on elements'}; keep it with "
                 f"crashkit ingest --fields {name}"

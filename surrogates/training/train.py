@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Iterable, Iterator
+from fnmatch import fnmatchcase
 
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogates.data.campaign import Campaign
+from surrogates.data.campaign import Campaign, CurveTarget
 from surrogates.data.graphs import Graphs
 from surrogates.data.inputs import Ranges
 from surrogates.data.samples import LevelRuns, Notes, check, everything, split
 from surrogates.data.scaling import InputScaling
 from surrogates.errors import SurrogateError
 from surrogates.models.cascade import Cascade
+from surrogates.models.curves import fit_curve
 from surrogates.models.pod_regression import PodFit, fit_pod_regression
 from surrogates.models.unified import Unified
 from surrogates.physics.choice import of_campaign
@@ -29,6 +32,11 @@ from surrogates.training.refinement import Refined
 from surrogates.training.trainer import Trainer
 from surrogates.uncertainty import FEWEST_BY_FOLDS, FEWEST_RUNS, Beliefs, calibrate_gathered, gather
 
+_log = logging.getLogger(__name__)
+
+# Told of each left-out run: the surrogate as far as it is, the place of the run, its displacements (state, node, 3), m.
+Watch = Callable[[Surrogate, int, NDArray[np.float32]], None]
+
 # Bytes of one run on the full mesh up to which lifted predictions are judged.
 _LARGEST_RUN = 2 << 30
 # States whose distances are worked out at once.
@@ -42,6 +50,7 @@ def train_surrogate(
     device: str = "cpu",
     report: Callable[[Epoch], None] | None = None,
     keeper: Keeper | None = None,
+    watch: Watch | None = None,
 ) -> Surrogate:
     """Fit the surrogate that `settings` describe to the runs of `campaign`.
 
@@ -56,6 +65,9 @@ def train_surrogate(
         Called after every epoch.
     keeper
         Where the state of the training is kept between epochs, to go on from after an interruption.
+    watch
+        Told of every left-out run: the surrogate as far as it is, the place of the run, and displacements (state, node, 3), m,
+        on the full mesh without it.
 
     Raises
     ------
@@ -75,20 +87,22 @@ def train_surrogate(
         campaign.parameter_names, campaign.parameter_units, campaign.parameters[parts.training], campaign.time,
         campaign.table_units,
     )  # fmt: skip
+    wanted = curve_targets(campaign, settings)
     trainer = Trainer(campaign, settings, graphs, parts, notes, device_of(device), report, keeper)
     record = Record.of(campaign, settings, ranges, parts)
     record.notes = notes.lines
     surrogate = Surrogate(settings, record, graphs, Cascade(scaling(settings, ranges)), campaign.points, campaign.faces)
     surrogate.labels = campaign.labels
     if of_pod:
-        _fit_regression(surrogate, trainer)
+        _fit_regression(surrogate, trainer, wanted, watch)
         return surrogate
     if by_folds:
         trainer = _registered(surrogate, trainer)
+    _fit_curves(surrogate, campaign, settings, parts.training, wanted)
     if settings.unified:
-        _fit_unified(surrogate, trainer)
+        _fit_unified(surrogate, trainer, watch)
     else:
-        _fit_cascade(surrogate, trainer)
+        _fit_cascade(surrogate, trainer, watch)
     fit_beside(surrogate, campaign, settings, parts.training, notes)
     return surrogate
 
@@ -130,7 +144,52 @@ def level_numbers(settings: Settings, graphs: Graphs) -> tuple[int, ...]:
     return chosen
 
 
-def _fit_regression(surrogate: Surrogate, trainer: Trainer) -> None:
+def curve_targets(campaign: Campaign, settings: Settings) -> tuple[CurveTarget, ...]:
+    """The channels that `settings.targets` name: by name, by pattern, or by the name of their resultant.
+
+    Raises
+    ------
+    SurrogateError
+        For a target that the campaign does not have.
+    """
+    out: dict[str, CurveTarget] = {}
+    known = [c.name for c in campaign.curves]
+    for target in settings.targets:
+        if not target.startswith("history:"):
+            continue
+        wish = target.removeprefix("history:")
+        names = [n for n in known if n == wish] or [n for n in known if fnmatchcase(n, wish)]
+        names = names or [n for n in known if n in {f"{wish}_{axis}" for axis in "xyz"}]
+        if not names:
+            some = ", ".join(known[:16]) or "no history"
+            raise SurrogateError(f"targets names {target!r}, and the dataset has {some}")
+        out |= {c.name: c for c in campaign.curves if c.name in names}
+    return tuple(out.values())
+
+
+def _fit_curves(
+    surrogate: Surrogate,
+    campaign: Campaign,
+    settings: Settings,
+    chosen: NDArray[np.int64],
+    wanted: tuple[CurveTarget, ...],
+) -> None:
+    """The histories beside the displacements, behind the same registration."""
+    for target in wanted:
+        assert campaign.curve_time is not None
+        _log.info("history %s", target.name)
+        mine = CurveTarget(target.name, target.unit, target.values[chosen])
+        found = fit_curve(
+            mine, campaign.curve_time, campaign.parameters[chosen], surrogate.registration, settings.validation.folds,
+            settings.seed, campaign.parameter_names,
+        )  # fmt: skip
+        found.held = {int(chosen[place]): curve for place, curve in found.held.items()}
+        surrogate.curves[target.name] = found
+
+
+def _fit_regression(
+    surrogate: Surrogate, trainer: Trainer, wanted: tuple[CurveTarget, ...], watch: Watch | None
+) -> None:
     """Everything is chosen by folds, and the errors and the band come from the runs each fold left out."""
     started = time.perf_counter()
     campaign, record, runs = trainer.campaign, surrogate.record, trainer.split.training
@@ -138,13 +197,14 @@ def _fit_regression(surrogate: Surrogate, trainer: Trainer) -> None:
     surrogate.core, surrogate.registration = found.core, found.registration
     record.choice = {"inputs": found.choice.inputs, "modes": found.choice.modes}
     record.physics = {**found.registration.told(), "errors": found.worth.errors}
-    _judge_by_folds(surrogate, trainer, found)
+    _fit_curves(surrogate, campaign, trainer.settings, runs, wanted)
+    _judge_by_folds(surrogate, trainer, found, watch)
     record.errors |= found.choice.errors
     fit_beside(surrogate, campaign, trainer.settings, runs, trainer.notes, found.trials)
     record.fits[0] = Fit(seconds=time.perf_counter() - started)
 
 
-def _judge_by_folds(surrogate: Surrogate, trainer: Trainer, found: PodFit) -> None:
+def _judge_by_folds(surrogate: Surrogate, trainer: Trainer, found: PodFit, watch: Watch | None) -> None:
     """Note e2 (m) over the left-out runs, and calibrate the band on them where there are enough."""
     runs, record = trainer.split.training, surrogate.record
     field = trainer.runs(0, surrogate.graphs)
@@ -156,6 +216,8 @@ def _judge_by_folds(surrogate: Surrogate, trainer: Trainer, found: PodFit) -> No
         for held in found.held():
             places.append(held.run)
             deviations.append(held.deviation)
+            if watch is not None:
+                watch(surrogate, int(runs[held.run]), held.predicted)
             distance = _off(held.predicted, field, runs[held.run])
             errors.append(_mean(distance))
             yield distance
@@ -179,7 +241,7 @@ def _judge_by_folds(surrogate: Surrogate, trainer: Trainer, found: PodFit) -> No
     surrogate.bands[0, False] = calibrate_gathered(gathered, record.time, beliefs, np.array(places))
 
 
-def _fit_unified(surrogate: Surrogate, trainer: Trainer) -> None:
+def _fit_unified(surrogate: Surrogate, trainer: Trainer, watch: Watch | None) -> None:
     numbers = level_numbers(trainer.settings, trainer.graphs)
     inputs = scaling(trainer.settings, surrogate.record.ranges)
     try:
@@ -192,10 +254,10 @@ def _fit_unified(surrogate: Surrogate, trainer: Trainer) -> None:
     finally:
         if isinstance(surrogate.core, Unified):
             surrogate.core.cpu()
-    _judge(surrogate, trainer)
+    _judge(surrogate, trainer, watch)
 
 
-def _fit_cascade(surrogate: Surrogate, trainer: Trainer) -> None:
+def _fit_cascade(surrogate: Surrogate, trainer: Trainer, watch: Watch | None) -> None:
     """Level after level; what is finished stays on `surrogate`, whatever happens to the next one."""
     cascade, record = surrogate.core, surrogate.record
     if not isinstance(cascade, Cascade):
@@ -225,14 +287,14 @@ def _fit_cascade(surrogate: Surrogate, trainer: Trainer) -> None:
             raise
     finally:
         cascade.cpu()
-    _judge(surrogate, trainer)
+    _judge(surrogate, trainer, watch)
 
 
 # A run, and the distances (state, node), m, between its truth and what is said of it without it.
 _Judged = tuple[int, NDArray[np.float32]]
 
 
-def _judge(surrogate: Surrogate, trainer: Trainer) -> None:
+def _judge(surrogate: Surrogate, trainer: Trainer, watch: Watch | None = None) -> None:
     """Note errors e2 (m) over runs that were left out, and calibrate the bands on them: on own nodes, and lifted."""
     if isinstance(trainer, FoldTrainer):
         surrogate.record.choice = _choices(surrogate, trainer)
@@ -246,6 +308,8 @@ def _judge(surrogate: Surrogate, trainer: Trainer) -> None:
 
         def own(number: int = number, runs: LevelRuns = runs, reduced: list[float] = reduced) -> Iterator[_Judged]:
             for run, predicted in _left_out(surrogate, trainer, number):
+                if watch is not None and number == min(surrogate.core.numbers):
+                    watch(surrogate, run, surrogate.lift(predicted, number))
                 truth = runs.read(run)
                 reduced.append(_mean(_off(surrogate.reconstruct(truth, number), runs, run)))
                 yield run, _off(predicted, runs, run)
