@@ -1,4 +1,4 @@
-"""Runs of a dataset as files for ParaView."""
+"""Runs of a dataset as files for ParaView, and models for programs without this package."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from crashkit.api.model import Model
+    from surrogates.surrogate import Surrogate
 
 
 def export_run(dataset: str | Path | xr.Dataset, run: str | int, output: str | Path) -> list[Path]:
@@ -36,12 +39,51 @@ def export_run(dataset: str | Path | xr.Dataset, run: str | int, output: str | P
         If `output` cannot be written.
     """
     from crashkit.dataset import open_dataset, reading_dataset
+    from crashkit.errors import OutputError
     from crashkit.selection import runs_of
+    from crashkit.writers.paraview import SUFFIXES
     from crashkit.writers.run import write_run
 
+    if Path(output).suffix not in SUFFIXES:
+        raise OutputError(f"{output}: a run is written as .pvd or .vtkhdf (.vtu or .vtp for a single state)")
     if isinstance(dataset, (str, Path)):
         with open_dataset(dataset, chunks=None) as opened, reading_dataset(dataset):
             return export_run(opened, run, output)
     names = [str(name) for name in dataset["sim"].values]
     place = runs_of(names, [run])[0]
     return write_run(dataset.isel(sim=place), Path(output), {"run": names[place]})
+
+
+def export_model(
+    model: Model | Surrogate | str | Path, output: str | Path, level: int | None = None, *, full: bool = False
+) -> float:
+    """Write a level of a model for programs without this package.
+
+    Parameters
+    ----------
+    model
+        As `crashkit.train` or `crashkit.load_model` return it, or the path of its folder.
+    output
+        `.onnx`, or `.pt2` for torch.export.
+    level
+        A mesh level of the model; without it the finest it has.
+    full
+        Include the interpolation to the full mesh.
+
+    Returns
+    -------
+    float
+        The largest difference between what was written and the model, over the largest displacement.
+
+    Raises
+    ------
+    SurrogateError
+        For a level that the model does not have, or what cannot be exported.
+    """
+    from crashkit.extras import need
+
+    need("exporting a model", "train")
+    from crashkit.api.predict import model_in_hand
+    from surrogates.storage.export import export
+
+    return export(model_in_hand(model).surrogate, Path(output), level, full=full)

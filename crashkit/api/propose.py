@@ -113,3 +113,24 @@ def _most_useful(
     points, share = known.best(known.of_runs(_parameters(dataset)), count, seed)
     error = known.judge(0.9, seed).error
     return points, {"expected_error_m": error, "expected_error_after_m": error * share}
+
+
+def write_table(table: pd.DataFrame, output: str | Path) -> None:
+    """Write what `propose` returns as CSV, with the unit of each parameter in its heading.
+
+    Raises
+    ------
+    OutputError
+        Where `output` cannot be written.
+    """
+    from crashkit.errors import OutputError
+    from data_schema.replace import beside
+
+    output = Path(output)
+    heads = [n if u in ("", "1") else f"{n} ({u})" for n, u in table.attrs["units"].items()]
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        with beside(output) as new:
+            table.to_csv(new, index=False, header=heads)
+    except OSError as error:
+        raise OutputError(f"{output}: cannot be written ({error.strerror or error}); choose another with -o") from error

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from data_schema.progress import Progress
 
@@ -47,6 +47,60 @@ class CampaignSummary:
     refused: int
     judgement: Judgement | None
     why: str
+
+
+@dataclass(frozen=True)
+class CampaignStatus:
+    """How far a campaign is, also while another process runs it.
+
+    Attributes
+    ----------
+    folder
+        Where it is kept.
+    counts
+        Runs by state: done, failed, refused, and those that wait or run.
+    lost
+        Name of each run that failed or was refused, and why.
+    rounds
+        What was judged after each batch: runs, error_m, low_m, high_m, solver_seconds.
+    page
+        The same as a page; None before the first batch.
+    """
+
+    folder: Path
+    counts: dict[str, int]
+    lost: dict[str, str]
+    rounds: list[dict[str, Any]]
+    page: Path | None
+
+
+def campaign_status(where: str | Path) -> CampaignStatus:
+    """How far the campaign is that is kept in the folder `where`, or beside the campaign file `where`.
+
+    Raises
+    ------
+    CrashkitError
+        Where no campaign is kept there.
+    """
+    from crashkit.campaign.table import FILE, STATES, Table
+    from crashkit.errors import CrashkitError
+
+    folder = Path(where) if Path(where).is_dir() else Path(where).with_suffix("")
+    if not (folder / FILE).exists():
+        raise CrashkitError(f"{folder}: no campaign is kept there (no {FILE}); give its folder or its campaign file")
+    table = Table(folder)
+    try:
+        runs, rounds = table.runs(), table.rounds()
+    finally:
+        table.close()
+    page = folder / "status.html"
+    return CampaignStatus(
+        folder,
+        {state: sum(run.state == state for run in runs) for state in STATES},
+        {run.name: f"{run.state}: {run.reason}" for run in runs if run.state in ("failed", "refused")},
+        rounds,
+        page if page.exists() else None,
+    )
 
 
 def run_campaign(

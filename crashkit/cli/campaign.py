@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -70,32 +70,24 @@ def command(
 
 def _status(where: Path, as_json: bool) -> None:
     """Counts and rounds of a campaign, also while another process runs it."""
-    from crashkit.campaign.table import FILE, STATES, Table
-    from crashkit.errors import CrashkitError
+    from crashkit.api.run_campaign import campaign_status
 
-    folder = where if where.is_dir() else where.with_suffix("")
-    if not (folder / FILE).exists():
-        raise CrashkitError(f"{folder}: no campaign is kept there (no {FILE}); give its folder or its campaign file")
-    runs_table = Table(folder)
-    runs, rounds = runs_table.runs(), runs_table.rounds()
-    runs_table.close()
-    counts: dict[str, Any] = {state: sum(r.state == state for r in runs) for state in STATES}
+    found = campaign_status(where)
     if as_json:
-        print_json({"folder": folder, **counts, "rounds": rounds})
+        print_json({"folder": found.folder, **found.counts, "rounds": found.rounds})
         return
-    say(f"{folder}: " + ", ".join(f"{n} {state}" for state, n in counts.items() if n))
-    for r in runs:
-        if r.state in ("failed", "refused"):
-            say(f"  {r.name} {r.state}: {r.reason}")
-    if rounds:
+    say(f"{found.folder}: " + ", ".join(f"{n} {state}" for state, n in found.counts.items() if n))
+    for name, why in found.lost.items():
+        say(f"  {name} {why}")
+    if found.rounds:
         table(
             "Error over the box",
             ("runs", "error (mm)", "interval (mm)", "solver time (min)"),
             (
                 (r["runs"], f"{1e3 * r['error_m']:.2f}", f"{1e3 * r['low_m']:.2f} to {1e3 * r['high_m']:.2f}",
                  f"{r['solver_seconds'] / 60:.1f}")
-                for r in rounds
+                for r in found.rounds
             ),
         )  # fmt: skip
-    if (folder / "status.html").exists():
-        say(f"{folder / 'status.html'}: the same as a page")
+    if found.page is not None:
+        say(f"{found.page}: the same as a page")

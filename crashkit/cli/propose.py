@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from crashkit.cli._console import print_json, say
+from crashkit.cli._console import names, print_json, say
 
 
 def command(
@@ -30,10 +30,8 @@ def command(
     """Propose the next runs: without a dataset they fill the box, with one they lower its error most."""
     from typing import get_args
 
-    from crashkit.api.propose import propose
+    from crashkit.api.propose import propose, write_table
     from crashkit.campaign.plan import Method
-    from crashkit.errors import OutputError
-    from data_schema.replace import beside
 
     if method not in get_args(Method):
         raise typer.BadParameter(f"{method!r}; expected one of {', '.join(get_args(Method))}", param_hint="--method")
@@ -41,15 +39,9 @@ def command(
         raise typer.BadParameter("give a dataset, or a box with --box box.yaml", param_hint="DATASET|--box")
     table = propose(
         dataset, count, box=box, method=method, seed=seed,  # type: ignore[arg-type]
-        odd=tuple(n.strip() for n in odd.split(",") if n.strip()),
+        odd=tuple(names(odd)),
     )  # fmt: skip
-    heads = [n if u in ("", "1") else f"{n} ({u})" for n, u in table.attrs["units"].items()]
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        with beside(output) as new:
-            table.to_csv(new, index=False, header=heads)
-    except OSError as error:
-        raise OutputError(f"{output}: cannot be written ({error.strerror or error}); choose another with -o") from error
+    write_table(table, output)
     now, after = table.attrs.get("expected_error_m"), table.attrs.get("expected_error_after_m")
     if json:
         print_json({"output": output, "runs": table.to_dict("records"), **table.attrs})
