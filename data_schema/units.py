@@ -153,6 +153,8 @@ _LONGEST = 60
 _POWERS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻−·⋅×µ∕⁄", "0123456789--***μ//")
 # A point between two words is a product ("kg.m-3"), as CF has it.
 _PRODUCT = re.compile(r"(?<=[^\W_])\.(?=[^\W\d_])")
+# Nothing but space between what ends a unit and what begins the next one.
+_BESIDE = re.compile(r"(?<=[\w)])\s*(?=\()|(?<=\))\s*(?=\w)|(?<=[\w)])\s+(?=[\w(])")
 # Written without a space, a metre per second and one per millisecond look alike.
 _TWO_MEANINGS = re.compile(r"ms\s?(?:\^|\*\*)?\s?\(?-[12]\)?")
 
@@ -232,7 +234,8 @@ def _understood(text: str) -> tuple[float, str] | None:
         # A lone prefix is no unit, though pint reads over it.
         if not all(registry.parse_unit_name(_spelled(m).split(")")[0][1:]) for m in _TOKEN.finditer(plain)):
             return None
-        spelled = _TOKEN.sub(_spelled, plain)
+        # What stands side by side is a product, said so: pint 0.26 reads "m (s)**-1" as 1/(m s), earlier ones as m/s.
+        spelled = _BESIDE.sub("*", _TOKEN.sub(_spelled, plain).strip())
         units = registry.parse_units(spelled)
         if not units._units or any(name not in _MECHANICS for name in _names(units)):
             return None
