@@ -63,7 +63,7 @@ def check(campaign: Campaign, settings: Settings, notes: Notes) -> None:
     if campaign.marked:
         told = "; ".join(f"{name}: {why}" for name, why in list(campaign.marked.items())[:3])
         more = f" and {len(campaign.marked) - 3} more" if len(campaign.marked) > 3 else ""
-        notes.add(f"trained on {len(campaign.marked)} runs that ingest marked ({told}{more})")
+        notes.add(f"ingest marked {len(campaign.marked)} of the training runs ({told}{more})")
     ranges = Ranges.of(names, campaign.parameter_units, campaign.parameters, campaign.time)
     for name in ranges.constant:
         if runs > 1:

@@ -65,6 +65,7 @@ def card(surrogate: Surrogate) -> str:
     else:
         lines.append("None were held out, so there is no independent error here.")
     lines += ["", *_bands(surrogate), *_hard(surrogate)]
+    lines += _elements(surrogate)
     lines += ["", "## Data", "", f"- dataset checksum (SHA-256): `{record.checksum or 'not recorded'}`"]
     lines += [f"- {_plain(key)}: {_plain(value)}" for key, value in record.attributes.items()]
     lines += [
@@ -89,6 +90,36 @@ def card(surrogate: Surrogate) -> str:
         "",
     ]
     return "\n".join(lines)
+
+
+def _elements(surrogate: Surrogate) -> list[str]:
+    """How well removal, and results on elements, are told of training runs that folds left out."""
+    out: list[str] = []
+    removal = surrogate.removal
+    if removal is not None:
+        out += ["", "## Removal of elements", ""]
+        out.append(
+            f"{len(removal.faces)} elements disappear in some training run or its image. How likely each is gone is told by: "
+            f"{', '.join(removal.terms)}."
+        )
+        rows = [
+            (name, *("-" if v != v else f"{v:.3g}" for v in (score.precision, score.recall, score.loss)))
+            for name, score in removal.scores.items()
+        ]
+        if rows:
+            out += ["", "On training runs that folds left out, called gone above a probability of one half:", ""]
+            out += _table(("what", "precision", "recall", "logarithmic loss"), rows)
+    for name, known in surrogate.fields.items():
+        out += [
+            "",
+            f"## {_plain(name)}",
+            "",
+            f"On elements, {known.modes.shape[1]} modes; unit {_plain(known.unit or '1')}.",
+        ]
+        if known.errors:
+            out += ["", "Mean absolute error over living elements of training runs that folds left out:", ""]
+            out += _table(("with", "error"), [(what, f"{error:.4g}") for what, error in known.errors.items()])
+    return out
 
 
 def _physics(surrogate: Surrogate) -> list[str]:

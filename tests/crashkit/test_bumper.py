@@ -296,6 +296,24 @@ def test_a_result_on_elements_is_known_on_every_level(
         assert coarse.mean() == pytest.approx(fine.mean(), rel=0.5)
 
 
+def test_the_card_tells_how_well_elements_are_told(
+    models: tuple[crashkit.Model, crashkit.Model], tmp_path: Path
+) -> None:
+    text = (models[0].save(tmp_path / "model") / "card.md").read_text()
+    assert "## Removal of elements" in text
+    assert "| rate of the element | - | 0 |" in text
+    assert "## plastic_strain" in text
+
+
+def test_a_training_says_that_runs_were_marked(few: xr.Dataset) -> None:
+    notes = ["", "added mass 12 %, the limit is 10 %", *[""] * (few.sizes["sim"] - 2)]
+    marked = few.assign(quality_note=("sim", notes))
+    model = crashkit.train(marked.isel(sim=slice(4)), model="pod-gpr", settings={"removal": "off"})
+    (note,) = [n for n in model.record.notes if "marked" in n]
+    assert "ingest marked 1 of the training runs" in note
+    assert "added mass 12 %" in note
+
+
 def test_a_target_that_is_not_there_is_named(few: xr.Dataset) -> None:
     with pytest.raises(crashkit.SurrogateError, match=r"temperature.*plastic_strain.*--fields temperature"):
         crashkit.train(few, model="pod-gpr", settings={"targets": ["displacement", "temperature"]})
