@@ -16,6 +16,8 @@ from crashkit.version import __version__ as __version__
 if TYPE_CHECKING:
     from crashkit.api.coarsen import coarsen as coarsen
     from crashkit.api.evaluate import evaluate as evaluate
+    from crashkit.api.explore import explore as explore
+    from crashkit.api.export import export_run as export_run
     from crashkit.api.invert import Inversion as Inversion
     from crashkit.api.invert import invert as invert
     from crashkit.api.model import Model as Model
@@ -23,6 +25,9 @@ if TYPE_CHECKING:
     from crashkit.api.optimise import optimise as optimise
     from crashkit.api.predict import load_model as load_model
     from crashkit.api.predict import predict as predict
+    from crashkit.api.propose import propose as propose
+    from crashkit.api.run_campaign import run_campaign as run_campaign
+    from crashkit.api.run_study import run_study as run_study
     from crashkit.api.scatter import scatter as scatter
     from crashkit.api.train import train as train
     from crashkit.api.validate import validate as validate
@@ -65,6 +70,8 @@ _LAZY = {
     "coarsen": "crashkit.api.coarsen",
     "demo_data": "crashkit.dataset",
     "evaluate": "crashkit.api.evaluate",
+    "explore": "crashkit.api.explore",
+    "export_run": "crashkit.api.export",
     "from_arrays": "crashkit.ingestion.arrays",
     "ingest": "crashkit.ingestion.ingest",
     "invert": "crashkit.api.invert",
@@ -73,6 +80,9 @@ _LAZY = {
     "open_hierarchy": "crashkit.mesh.store",
     "optimise": "crashkit.api.optimise",
     "predict": "crashkit.api.predict",
+    "propose": "crashkit.api.propose",
+    "run_campaign": "crashkit.api.run_campaign",
+    "run_study": "crashkit.api.run_study",
     "scatter": "crashkit.api.scatter",
     "train": "crashkit.api.train",
     "validate": "crashkit.api.validate",
