@@ -78,7 +78,7 @@ class StreamedPod:
         self.count = count
         self.keep = max(count, 2 * count + 16 if keep is None else keep)
         self._defect = 0.0
-        self._factor: NDArray[np.float32] | None = None  # U S, (3 * node, <= keep): columns are orthogonal
+        self._factor: NDArray[np.float32] | None = None  # (U S)^T, (keep, 3 * node), of which some rows are in use
         self._energy: NDArray[np.float64] = np.empty(0)  # squares of S
         self._waiting: list[NDArray[np.float32]] = []
 
@@ -92,7 +92,7 @@ class StreamedPod:
         """
         new = np.ascontiguousarray(run, np.float32).reshape(len(run), -1)
         before = self._waiting[0].shape[1] if self._waiting else new.shape[1]
-        before = before if self._factor is None else len(self._factor)
+        before = before if self._factor is None else self._factor.shape[1]
         if before != new.shape[1]:
             raise ValueError(
                 f"a run of {new.shape[1] // 3} nodes follows runs of {before // 3}; expected the same nodes in all"
@@ -108,25 +108,27 @@ class StreamedPod:
             return
         waiting, self._waiting = self._waiting, []
         length, count, known = waiting[0].shape[1], sum(map(len, waiting)), len(self._energy)
-        old = np.empty((length, 0), np.float32) if self._factor is None else self._factor
+        factor = self._factor if self._factor is not None else np.empty((self.keep, length), np.float32)
         # What is kept is orthogonal, so only products with what is new have to be made.
         gram = np.zeros((known + count, known + count))
-        for rows in _blocks(length):
-            new = np.concatenate([run[:, rows] for run in waiting]).astype(np.float64)
+        for columns in _blocks(length):
+            new = np.concatenate([run[:, columns] for run in waiting]).astype(np.float64)
             gram[known:, known:] += new @ new.T
             if known:
-                gram[known:, :known] += new @ old[rows].astype(np.float64)
+                gram[known:, :known] += new @ factor[:known, columns].astype(np.float64).T
         gram[:known, :known] = np.diag(self._energy)
         gram[:known, known:] = gram[known:, :known].T
         energy, vectors = np.linalg.eigh(gram)
         energy, vectors = energy[::-1].clip(0), vectors[:, ::-1]
         kept = min(self.keep, max(1, int((energy > energy[0] * _ROUNDING_SQUARED).sum())))
         self._defect += float(energy[kept]) if kept < len(energy) else 0.0
-        turn, mix = vectors[:known, :kept], vectors[known:, :kept]
-        factor = old if kept == known else np.empty((length, kept), np.float32)
-        for rows in _blocks(length):
-            out = np.concatenate([run[:, rows] for run in waiting]).astype(np.float64).T @ mix
-            factor[rows] = out + old[rows].astype(np.float64) @ turn if known else out
+        turn, mix = vectors[:known, :kept].T, vectors[known:, :kept].T
+        for columns in _blocks(length):  # in place, so that what is kept is in memory once
+            new = np.concatenate([run[:, columns] for run in waiting]).astype(np.float64)
+            out = mix @ new
+            if known:
+                out += turn @ factor[:known, columns].astype(np.float64)
+            factor[:kept, columns] = out
         self._factor, self._energy = factor, energy[:kept]
 
     @property
@@ -146,21 +148,21 @@ class StreamedPod:
         self._merge()
         if self._factor is None:
             raise ValueError("no runs to decompose; expected at least one")
-        factor = self._factor[:, : self.count]
-        squares = np.zeros(factor.shape[1])
-        for rows in _blocks(len(factor)):
-            squares += np.square(factor[rows], dtype=np.float64).sum(axis=0)
+        factor = self._factor[: min(self.count, len(self._energy))]
+        squares = np.zeros(len(factor))
+        for columns in _blocks(factor.shape[1]):
+            squares += np.square(factor[:, columns], dtype=np.float64).sum(axis=1)
         values = np.sqrt(squares)
         good = (values > 0) & (values > values[0] * _ROUNDING)
         if not good.any():  # nothing moves: one mode of zeros, so that everything projects to zero
-            return Pod(np.zeros((len(factor), 1), np.float32), np.zeros(1), self._defect)
+            return Pod(np.zeros((factor.shape[1], 1), np.float32), np.zeros(1), self._defect)
+        largest = [int(np.abs(row).argmax()) for row in factor]
+        sign = np.sign(factor[np.arange(len(factor)), largest])
+        scaled = (sign / np.where(good, values, 1.0))[good]
         # In blocks: no further array is as large as all modes.
-        modes = np.empty((len(factor), int(good.sum())), np.float32)
-        for rows in _blocks(len(factor)):
-            modes[rows] = factor[rows][:, good] / values[good]
-        for k in range(modes.shape[1]):
-            if modes[np.abs(modes[:, k]).argmax(), k] < 0:
-                modes[:, k] *= -1
+        modes = np.empty((factor.shape[1], len(scaled)), np.float32)
+        for columns in _blocks(factor.shape[1]):
+            modes[columns] = factor[good, columns].T * scaled
         return Pod(modes, values[good], self._defect)
 
 

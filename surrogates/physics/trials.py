@@ -37,7 +37,7 @@ _NUMBERS = 3e8
 _SMALLEST = 1e-5
 _TRANSLATIONS = 3
 # Modes carried along beside those of the basis, and rows of it worked on at once.
-_KEPT_BESIDE, _ROWS = 32, 1 << 13
+_KEPT_BESIDE, _ROWS = 16, 1 << 13
 # States of a run that the basis is made of, nodes and states on which errors are measured, states of the likelihood.
 _BASIS_STATES = 32
 _JUDGED_NODES, _JUDGED_STATES = 400, 21
@@ -351,7 +351,7 @@ def _basis(
     out = np.zeros((3 * runs.nodes, _TRANSLATIONS + moving), np.float32)
     out.reshape(-1, 3, out.shape[1])[:, :, :_TRANSLATIONS] = np.eye(3) / np.sqrt(runs.nodes)
     if moving:
-        out[:, _TRANSLATIONS:] = found.modes[:, good]
+        out[:, _TRANSLATIONS:] = found.modes[:, :moving]  # those are the first ones
         del found
         _orthonormal(out)
     return out
