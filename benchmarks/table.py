@@ -22,7 +22,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-SCRIPTS = ("coarsen", "damage", "ingest_memory", "paraview", "train_step", "predict", "time_to_error")
+SCRIPTS = ("coarsen", "damage", "ingest_memory", "paraview", "train_step", "predict", "time_to_error", "vehicle")
 FIELDS = {"what", "ratio", "goal", "sense", "note"}
 
 
