@@ -15,6 +15,7 @@ from crashkit.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from crashkit.api.coarsen import coarsen as coarsen
+    from crashkit.api.estimator import Surrogate as Surrogate
     from crashkit.api.evaluate import evaluate as evaluate
     from crashkit.api.explore import explore as explore
     from crashkit.api.export import export_run as export_run
@@ -64,6 +65,7 @@ _LAZY = {
     "Optimum": "crashkit.api.optimise",
     "OutputError": "crashkit.errors",
     "ReadError": "crashkit.errors",
+    "Surrogate": "crashkit.api.estimator",
     "SurrogateError": "surrogates.errors",
     "Violation": "data_schema",
     "bumper_data": "crashkit.dataset",

@@ -43,6 +43,19 @@ def test_speed_and_strength(
     assert "impact_speed^1.22: 25 % off on 9 test runs" in told
 
 
+def test_cross_validate(
+    demo_dataset: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run(monkeypatch, "cross_validate.py", demo_dataset, "27:36")
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(" R²")[0].strip() for line in lines[:3]] == [
+        "mean of the runs",
+        "quadratic",
+        "crashkit.Surrogate",
+    ]
+    assert "'model': 'pod-gpr'" in lines[3]
+
+
 def test_worst_moment(
     demo_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
