@@ -81,7 +81,7 @@ class PodRegression:
 
     def coefficients(self, parameters: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float64]:
         """(run, p) and (state,), s -> (run, state, mode), m. Between trained times the course is interpolated."""
-        x = self._scaled(parameters)
+        x = self.scaled(parameters)
         r = self.modes.shape[1]
         if self.inputs == "trajectory":
             known = self.data.values.reshape(len(self.data.values), -1)
@@ -96,12 +96,12 @@ class PodRegression:
 
     def weights(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
         """(run, p) -> (run, training sample): how much each training run enters, where a run is one sample."""
-        return self.machine.weights(self._scaled(parameters))
+        return self.machine.weights(self.scaled(parameters))
 
     def deviation(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
         """(run, p) -> (run,): what the process believes its error to be, up to a factor; ones where it believes nothing."""
         if self.inputs == "trajectory" and isinstance(self.machine, Gaussian):
-            return self.machine.deviation(self._scaled(parameters))
+            return self.machine.deviation(self.scaled(parameters))
         return np.ones(len(parameters))
 
     def displacement(
@@ -154,7 +154,7 @@ class PodRegression:
         machine = Gaussian.load(x, a) if model == "pod-gpr" else RadialBasis(x)
         return cls(a["modes"], data, machine, inputs, a["low"], a["high"], samples)
 
-    def _scaled(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+    def scaled(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
         return over_range(parameters, np.stack([self.low, self.high]))
 
 

@@ -3,7 +3,8 @@
 A surrogate errs, and its errors at neighbouring points go together: twenty points that are all two centimetres off are
 one piece of evidence, not sixty. So the noise of a measurement has two parts (Kennedy and O'Hagan 2001, doi
 10.1111/1467-9868.00294): the measurement's own, independent, and the model's, whose size at each point and state is the
-band's, and whose correlation is that of the errors that a regression of the same runs makes on runs left out.
+band's, and whose correlation is that of errors on runs left out: of the process's own, or, for networks, of a
+regression of what they say of the training runs.
 
 Such errors are not normally distributed: most runs are predicted far better than the band says, a few worse. So the
 likelihood is raised to a power, chosen so that the region of 90 % would have held the parameters of nine in ten
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 # The region whose coverage sets the power of the likelihood, and the step of derivatives in widths of the box.
 _REGION, _STEP = 0.9, 1e-3
+# Parts in which training runs are judged by the others.
+_FOLDS = 8
 # Variance of the constant that stands for the unknown mean of a process.
 _MEAN = 100.0
 # Parameters that stand for the box where the training runs' own are not stored.
@@ -78,15 +81,17 @@ class Misfit:
         ranges = surrogate.record.ranges
         self.free = ranges.high > ranges.low if free is None else free
         runs = _training_parameters(surrogate)
-        patterns = error_patterns(self.predicted, surrogate, runs)
+        found = points.left_out()
+        patterns = (
+            error_patterns(self.predicted, surrogate, runs)
+            if found is None
+            else found[:, measured.state, measured.point, measured.component]
+        )
         known = points.deviation()
         self.banded = known is not None
         size = np.sqrt(np.square(patterns).mean(axis=0))
         self.model_error = size if known is None else known[measured.state, measured.point]
-        scaled = self.model_error / measured.deviation
-        self._values, vectors = np.linalg.eigh(_correlation(patterns) * np.outer(scaled, scaled))
-        self._values = np.maximum(self._values, 0.0)
-        self._turn = vectors / measured.deviation[:, None]
+        self._values, self._turn = self._whitening(patterns)
         self._left_out, drops = self._of_left_out(runs, patterns * (self.model_error / np.where(size > 0, size, 1)))
         self.power = _power(drops, int(self.free.sum()))
 
@@ -154,8 +159,14 @@ class Misfit:
         """(run, number): what is left of the measurement, in deviations, free of correlation."""
         return np.asarray((self.measured.value - self.predicted(parameters)) @ self._turn / self._scale(self.size))
 
-    def _scale(self, size: float | NDArray[np.float64]) -> NDArray[np.float64]:
+    def _scale(self, size: float) -> NDArray[np.float64]:
         return np.asarray(np.sqrt(np.square(size) * self._values + 1))
+
+    def _whitening(self, errors: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Variances (number,) of the model's error against the measurement's, and the turn (number, number) to them."""
+        scaled = self.model_error / self.measured.deviation
+        values, vectors = np.linalg.eigh(_correlation(errors) * np.outer(scaled, scaled))
+        return np.maximum(values, 0.0), vectors / self.measured.deviation[:, None]
 
     def _pieces(self, parameters: NDArray[np.float64]) -> int:
         return -(-len(parameters) * len(self.measured.value) * (1 + parameters.shape[1]) // _HELD) or 1
@@ -165,19 +176,24 @@ class Misfit:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(run,): squared deviations of each training run from its own parameters, and the part that others take away.
 
-        errors (run, number), m: what the model without the run is off by.
+        errors (run, number), m: what the model without the run is off by. No run is judged by a correlation that it
+        was part of.
         """
         ranges = self.points.surrogate.record.ranges
-        scale = self._scale(self.points.spread(runs)[:, None])
-        off = errors @ self._turn / scale
-        at, slopes = self.predicted(runs), []
+        at, moved = self.predicted(runs), []
         for k in np.flatnonzero(self.free):
             step = np.zeros_like(runs)
             step[:, k] = _STEP * (ranges.high - ranges.low)[k] * np.where(runs[:, k] > ranges.low[k], -1, 1)
-            slopes.append((self.predicted(runs + step) - at) @ self._turn / scale)
-        basis = np.linalg.qr(np.stack(slopes, axis=-1))[0]  # (run, number, parameter)
-        explained = np.square(np.einsum("nqk,nq->nk", basis, off)).sum(axis=1)
-        return np.square(off).sum(axis=1), explained
+            moved.append(self.predicted(runs + step) - at)
+        slopes, sizes = np.stack(moved, axis=-1), self.points.spread(runs)
+        whole, explained = np.empty(len(runs)), np.empty(len(runs))
+        for held in np.array_split(np.random.default_rng(0).permutation(len(runs)), min(_FOLDS, len(runs))):
+            values, turn = self._whitening(np.delete(errors, held, axis=0))
+            for k in held:
+                scale = np.sqrt(np.square(sizes[k]) * values + 1)
+                off, basis = errors[k] @ turn / scale, np.linalg.qr((turn.T @ slopes[k]) / scale[:, None])[0]
+                whole[k], explained[k] = np.square(off).sum(), np.square(off @ basis).sum()
+        return whole, explained
 
 
 def _power(drops: NDArray[np.float64], parameters: int) -> float:

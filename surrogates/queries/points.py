@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from surrogates.models.pod_regression import PodRegression
+from surrogates.regression.gaussian import Gaussian
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 
 # Runs that are predicted at once.
 _CHUNK = 2048
+# Variance of the constant that stands for the unknown mean of a process.
+_MEAN = 100.0
 # What a band's quantiles do not say: the smallest ratios are taken to rise evenly from zero.
 _INNER = np.linspace(0.0, 0.5, 51)
 
@@ -79,14 +82,51 @@ class AtPoints:
             return np.ones(len(parameters))
         return band.of_runs(self.surrogate.beliefs(parameters))
 
+    def left_out(self) -> NDArray[np.float64] | None:
+        """(training run, state, point, 3), m: what a process over whole runs is off by where each run is left out of it.
+
+        The run's image in a mirror is left out with it; modes and kernel are those of all runs. In the order of
+        `record.parameters`; None for other models, and where a folder does not hold what this takes.
+        """
+        surrogate, core = self.surrogate, self.surrogate.core
+        lists = [surrogate.record.parameters.get(n, []) for n in surrogate.record.ranges.names]
+        if not isinstance(core, PodRegression) or not isinstance(core.machine, Gaussian) or core.inputs != "trajectory":
+            return None
+        runs, x = np.array(lists, np.float64).T, core.machine.x
+        if len(runs) < 3 or not x.shape[1] or len(x) % len(runs):
+            return None
+        registration = surrogate.registration
+        if not np.allclose(core.scaled(registration.read(runs)), x[: len(runs)], atol=1e-6):
+            return None
+        values = core.data.values.astype(np.float64).reshape(len(x), -1)
+        kernel = core.machine.kernel
+        inverse = np.linalg.inv(kernel(x, x) + _MEAN + (kernel.noise + 1e-10) * np.eye(len(x)))
+        pulled = inverse @ values
+        courses = []
+        for k in range(len(runs)):
+            own = np.arange(k, len(x), len(runs))
+            courses.append(np.linalg.solve(inverse[np.ix_(own, own)], pulled[own])[0])
+        known = np.array(courses).reshape(len(runs), len(core.data.time), -1)
+        times = np.stack([registration.clock.times(one, self.time) for one in runs])
+        every = np.eye(len(runs))
+        out = (
+            np.stack([between_courses(every, known, core.data.time, t) for t in times.T], axis=1)
+            @ self._modes_here(core).T
+        )
+        out *= registration.clock.size(runs)[:, None, None]
+        return np.asarray(out.reshape(len(runs), len(self.time), -1, 3))
+
+    def _modes_here(self, core: PodRegression) -> NDArray[np.float64]:
+        """(3 * point, mode)."""
+        r = core.modes.shape[1]
+        return np.asarray(self.where @ core.modes.reshape(-1, 3 * r).astype(np.float64)).reshape(-1, r)
+
     def _band(self) -> Band | None:
         return self.surrogate.bands.get((self.level, self.level > 0))
 
     def _by_process(self, core: PodRegression) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
         """The modes are read at the points once; what is left is the regression of few numbers."""
-        r = core.modes.shape[1]
-        modes = core.modes.reshape(-1, 3 * r).astype(np.float64)
-        here = np.asarray(self.where @ modes).reshape(-1, r)  # (3 * point, mode)
+        here = self._modes_here(core)
         known, registration = core.data.values.astype(np.float64), self.surrogate.registration
         trajectory = core.inputs == "trajectory"
 

@@ -12,8 +12,10 @@ from scipy import sparse
 from scipy.interpolate import PchipInterpolator
 
 from surrogates.errors import SurrogateError
+from surrogates.models.pod_regression import PodRegression
 from surrogates.queries.points import AtPoints, between_courses
 from surrogates.queries.posterior import posterior
+from surrogates.regression.gaussian import Gaussian
 from surrogates.settings import settings
 from surrogates.surrogate import Surrogate
 from surrogates.training.train import train_surrogate
@@ -22,7 +24,10 @@ from surrogates.uncertainty import Spread
 
 @pytest.fixture(scope="module")
 def process() -> Surrogate:
-    return train_surrogate(plate.campaign(16), settings("pod-gpr"))
+    return train_surrogate(
+        plate.campaign(16),
+        settings("pod-gpr", overrides=["physics.clock=off", "physics.symmetry=off", "inputs.derived=off"]),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +73,23 @@ def test_the_error_of_a_run_goes_with_the_width_of_its_band(process: Surrogate, 
     found = AtPoints(surrogate, WHERE, plate.TIME).spread(mu)
     widths = [surrogate.band(0.9, parameters=one).mean() / surrogate.band(0.9).mean() for one in mu]
     np.testing.assert_allclose(found, widths, rtol=1e-5)
+
+
+def test_errors_of_left_out_runs_are_those_of_a_process_without_them(process: Surrogate) -> None:
+    """Left out by linear algebra, and left out in fact: the same kernel and modes, one run fewer."""
+    core = process.core
+    assert isinstance(core, PodRegression)
+    points = AtPoints(process, WHERE, plate.TIME[[3, 6]])
+    found = points.left_out()
+    assert found is not None
+    runs = np.array([process.record.parameters[n] for n in process.record.ranges.names]).T
+    rest = np.arange(1, len(runs))
+    machine = Gaussian(core.machine.x[rest], core.machine.kernel)
+    weights = machine.weights(core.machine.x[:1])
+    values = core.data.values.astype(np.float64)
+    course = values[0] - np.einsum("s,stm->tm", weights[0], values[rest])
+    here = (core.modes.reshape(81, -1)[3]).reshape(3, -1)  # of the first point
+    assert np.allclose(found[0, :, 0], course[[3, 6]] @ here.T, atol=1e-4 * np.abs(found).max())
 
 
 class Bells:
