@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 _log = logging.getLogger(__name__)
 
+# Steps between samples that differ by more than this share of their mean are uneven.
+_EVEN = 0.02
 # Bytes of a level's displacements up to which they are read at once.
 _AT_ONCE = 128 << 20
 
@@ -165,7 +167,8 @@ def open_campaign(
 def histories(dataset: xr.Dataset) -> tuple[NDArray[np.float64] | None, list[tuple[str, str, NDArray[np.float64]]]]:
     """Times (sample,), s, that runs share, and of each channel its name, unit and values (sim, sample); NaN behind a run's end.
 
-    Runs that were sampled at other times than the first are interpolated.
+    Runs that were sampled at other times are interpolated. Solvers write a sample at the end of the time step in which it is
+    due; where that makes the samples uneven, they are brought to even times, which filters need.
     """
     import numpy as np
 
@@ -177,6 +180,8 @@ def histories(dataset: xr.Dataset) -> tuple[NDArray[np.float64] | None, list[tup
     longest = times[int(np.argmax(np.isfinite(times).sum(axis=1)))]
     time = longest[np.isfinite(longest)]
     time = time[time <= float(np.median(ends)) * (1 + 1e-6)]
+    if len(time) > 2 and np.ptp(np.diff(time)) > _EVEN * np.diff(time).mean():
+        time = np.linspace(time[0], time[-1], len(time))
     out = np.full((len(values), len(time), values.shape[2]), np.nan)
     # The last samples of runs of one length differ by less than a time step.
     slack = np.diff(time).max() if len(time) > 1 else 0.0

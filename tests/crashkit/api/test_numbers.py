@@ -176,3 +176,16 @@ def test_histories_of_runs_with_other_times_come_on_common_ones(runs: xr.Dataset
     np.testing.assert_allclose(found[0][2][4], known[0][2][4])
     half = time < 0.45 * time[-1]
     np.testing.assert_allclose(found[0][2][3][half], np.interp(time[half] * 2, time, known[0][2][3]), rtol=1e-6)
+
+
+def test_samples_that_are_late_by_a_time_step_come_on_even_times(runs: xr.Dataset) -> None:
+    time, known = histories(runs)
+    assert time is not None
+    late = runs.copy(deep=True)
+    shift = 0.03 * np.diff(time).mean() * np.random.default_rng(0).random(len(time) - 2)
+    late["history_time"][:, 1:-1] = late["history_time"].values[:, 1:-1] + shift
+    even, found = histories(late)
+    assert even is not None
+    np.testing.assert_allclose(np.diff(even), np.diff(even).mean(), rtol=1e-9)
+    own = late["history_time"].values[2]
+    np.testing.assert_allclose(found[0][2][2], np.interp(even, own, known[0][2][2]), rtol=1e-5, atol=1e-3)
