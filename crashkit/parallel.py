@@ -81,7 +81,7 @@ def _on_workers(
     with _client(workers, scheduler, patience) as client:
         (there,) = client.scatter([shared], broadcast=True, hash=False)
         places = {client.submit(job, item, there, pure=False, retries=0): k for k, item in enumerate(items)}
-        for future in as_completed(list(places)):
+        for future in as_completed(list(places), loop=client.loop):
             place = places[future]
             try:
                 result = future.result()
@@ -111,7 +111,8 @@ def _client(workers: int, scheduler: str | None, patience: float) -> Iterator[An
         else:
             address = scheduler
         try:
-            client = stack.enter_context(Client(address, timeout=patience))
+            # Nobody's default: what this process reads and writes besides asks nothing of these workers, also once they are gone.
+            client = stack.enter_context(Client(address, timeout=patience, set_as_default=False))
         except (OSError, ValueError) as error:
             if scheduler is None:
                 raise CrashkitError(f"the processes on this machine do not answer ({error}); use one worker") from error
