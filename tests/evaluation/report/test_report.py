@@ -58,8 +58,8 @@ def parsed(path: Path) -> _Page:
     return page
 
 
-# Shown where models say something of elements; tests/crashkit/test_bumper.py draws them.
-OF_ELEMENTS = ("removal", "element_fields")
+# Shown where models say something of elements, curves or numbers; tests/crashkit/test_bumper.py and test_numbers.py draw them.
+OF_OTHER_TARGETS = ("removal", "element_fields", "numbers", "histories")
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def report(evaluation, tmp_path_factory) -> Iterator[Path]:
 def test_every_figure_is_there_three_times(report):
     page = parsed(report)
     for name in ORDER:
-        if name in OF_ELEMENTS:
+        if name in OF_OTHER_TARGETS:
             continue
         assert f"figure-{name}" in page.ids
         png, svg, numbers = (report.parent / "figures" / f"{name}.{s}" for s in ("png", "svg", "csv"))
