@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crashkit.api._design import Known
+from crashkit.api._design import TrainedProcess
 from crashkit.api.campaign import open_campaign
 from crashkit.api.source import source_of
 from crashkit.campaign.box import Box
@@ -107,7 +107,7 @@ class Replay:
                 if count in counts or not done:
                     surrogate = self.trained(chosen[:count])
                     if count in counts:
-                        judgement = Known.of(surrogate, self.box).judge(0.9)
+                        judgement = TrainedProcess.of(surrogate, self.box).judge(0.9)
                         out[count] = (self.error(surrogate, judged), (judgement.error, judgement.low, judgement.high))
             if done or len(chosen) >= max(counts):
                 return out
@@ -122,7 +122,7 @@ class Replay:
         return train_surrogate(some, settings("pod-gpr", overrides=told))
 
     def ask(self, surrogate: Surrogate, chosen: list[int], pool: list[int]) -> list[int]:
-        known = Known.of(surrogate, self.box)
+        known = TrainedProcess.of(surrogate, self.box)
         left = [k for k in pool if k not in set(chosen)]
         over = known.parameters(known.points(0, 512))
         weights = known.size(over)

@@ -25,7 +25,7 @@ _MEAN = 100.0
 
 
 @dataclass
-class Known:
+class TrainedProcess:
     """A trained process and its box, in the units of the process.
 
     Attributes
@@ -39,7 +39,7 @@ class Known:
     scale: NDArray[np.float64]
 
     @classmethod
-    def of(cls, surrogate: Surrogate, box: Box) -> Known:
+    def of(cls, surrogate: Surrogate, box: Box) -> TrainedProcess:
         """Raises CampaignError where the box is not that of the model."""
         from data_schema import to_si
 

@@ -1,4 +1,4 @@
-"""Runs as formulas ask for them (`evaluation.measures.formula.Runs`): predicted by a model, or given as arrays."""
+"""Runs as formulas ask for them (`evaluation.measures.formula.FormulaRuns`): predicted by a model, or given as arrays."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Error = Callable[[NDArray[np.int64]], NDArray[np.floating]]
 
 
 @dataclass(frozen=True)
-class Structure:
+class FormulaMesh:
     """The mesh and the parameters that formulas may speak of.
 
     Attributes
@@ -43,14 +43,14 @@ class Structure:
     units: tuple[str, ...]
 
     @classmethod
-    def of(cls, surrogate: Surrogate) -> Structure:
+    def of(cls, surrogate: Surrogate) -> FormulaMesh:
         """Of a model."""
         ranges = surrogate.record.ranges
         size = surrogate.graphs.n_nodes(0)
         return cls(size, surrogate.labels, surrogate.points, surrogate.faces, ranges.names, ranges.units)
 
     @classmethod
-    def of_campaign(cls, campaign: Campaign) -> Structure:
+    def of_campaign(cls, campaign: Campaign) -> FormulaMesh:
         """Of the runs a model is trained on."""
         names, units = campaign.parameter_names, campaign.parameter_units
         return cls(campaign.n_nodes, campaign.labels, campaign.points, campaign.faces, names, units)
@@ -76,7 +76,7 @@ class GivenRuns:
 
     def __init__(
         self,
-        structure: Structure,
+        structure: FormulaMesh,
         parameters: Floats,
         time: Floats,
         states: NDArray[np.floating] | None = None,
@@ -130,7 +130,7 @@ class PredictedRuns(GivenRuns):
     def __init__(
         self,
         surrogate: Surrogate,
-        structure: Structure,
+        structure: FormulaMesh,
         parameters: Floats,
         time: Floats,
         level: int,
@@ -186,7 +186,7 @@ class PredictedRuns(GivenRuns):
         return (*self._surrogate.curves, *self.structure.names)
 
 
-def true_runs(structure: Structure, campaign: Campaign, run: int) -> GivenRuns:
+def true_runs(structure: FormulaMesh, campaign: Campaign, run: int) -> GivenRuns:
     """One training run as it was computed."""
     states = np.asarray(campaign.displacement(0)[run])[None]
     return GivenRuns(structure, campaign.parameters[run : run + 1], campaign.time, states, curves_of(campaign, run))
@@ -208,4 +208,4 @@ def dry_runs(campaign: Campaign, channels: Sequence[str]) -> Any:
         for c in campaign.curves
         if c.name in channels
     }
-    return GivenRuns(Structure.of_campaign(campaign), campaign.parameters[:1], campaign.time, states, zeros)
+    return GivenRuns(FormulaMesh.of_campaign(campaign), campaign.parameters[:1], campaign.time, states, zeros)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from crashkit.selection import WhichRuns
     from data_schema.levels import Level
     from evaluation.comparison.beside import Beside
-    from evaluation.comparison.predictor import Model
+    from evaluation.comparison.predictor import ComparedModel
     from evaluation.comparison.reference import Reference
     from evaluation.comparison.result import Evaluation
     from evaluation.comparison.scoring import RunScores
@@ -167,9 +167,9 @@ def _note_bands(asked: Sequence[tuple[str, Trained | Path]], result: Evaluation)
     """Beside each stored model: what share of the test runs its band held, which `predict` tells with later bands."""
     import numpy as np
 
-    from surrogates.storage.tested import Held, note_held
+    from surrogates.storage.tested import BandCheck, note_held
 
-    of_model: dict[int, dict[str, Held]] = {}
+    of_model: dict[int, dict[str, BandCheck]] = {}
     for entry in result.entries:
         for (model, _), predictor, covered in zip(
             entry.keys,
@@ -179,7 +179,7 @@ def _note_bands(asked: Sequence[tuple[str, Trained | Path]], result: Evaluation)
         ):
             known = covered[np.isfinite(covered)]
             if len(known):
-                of_model.setdefault(model, {})[predictor.name] = Held(float(known.mean()), len(known))
+                of_model.setdefault(model, {})[predictor.name] = BandCheck(float(known.mean()), len(known))
     for model, held in of_model.items():
         given = asked[model][1]
         folder = given if isinstance(given, Path) else given.folder
@@ -191,7 +191,7 @@ def _beside(source: Source, result: Evaluation, tell: Progress) -> Beside | None
     """Histories and numbers of the models that have any, on their finest level, against the truth."""
     import numpy as np
 
-    from crashkit.api._predicted import GivenRuns, Structure
+    from crashkit.api._predicted import FormulaMesh, GivenRuns
     from crashkit.api.campaign import histories
     from crashkit.api.numbers import half_width, model_formulas, predicted_numbers
     from evaluation.comparison.beside import SHARE, Beside, CurveCompared, NumberCompared
@@ -213,7 +213,7 @@ def _beside(source: Source, result: Evaluation, tell: Progress) -> Beside | None
     parameters = {label: reference.parameters[test][:, list(one.order)] for label, one in asked.items()}
     numbers: dict[tuple[str, str, str], tuple[Any, dict[str, Any], dict[str, float]]] = {}
     for label, one in asked.items():
-        formulas, structure = model_formulas(one.surrogate), Structure.of(one.surrogate)
+        formulas, structure = model_formulas(one.surrogate), FormulaMesh.of(one.surrogate)
         said = [predicted_numbers(one.surrogate, p[None]) for p in parameters[label]]
         for k, (name, formula) in enumerate(formulas.items()):
             key = (name, formula.text, said[0][k].unit)
@@ -284,7 +284,7 @@ def _asked(models: GivenModel | Sequence[GivenModel]) -> tuple[tuple[str, Traine
 
 
 def _test_names(
-    source: Source, reference: Reference, models: Sequence[Model], test: WhichRuns | None
+    source: Source, reference: Reference, models: Sequence[ComparedModel], test: WhichRuns | None
 ) -> Sequence[str] | None:
     """Names of the test runs that were asked for; None to take those that the models hold out."""
     from crashkit.selection import runs_of
@@ -353,7 +353,7 @@ class Scorer:
     models: tuple[tuple[str, Trained | Path], ...]
     modes: Mapping[int, str]
     sensors: Sensors
-    opened: tuple[Reference, tuple[Model, ...]] | None = None
+    opened: tuple[Reference, tuple[ComparedModel, ...]] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "opened": None}
@@ -384,7 +384,9 @@ def _keep_modes(pods: Mapping[int, Any], folder: Path) -> dict[int, str]:
     return out
 
 
-def _opened(source: Source, models: tuple[tuple[str, Trained | Path], ...]) -> tuple[Reference, tuple[Model, ...]]:
+def _opened(
+    source: Source, models: tuple[tuple[str, Trained | Path], ...]
+) -> tuple[Reference, tuple[ComparedModel, ...]]:
     """The dataset and the models as evaluation sees them."""
     from crashkit.api.predict import model_in_hand
     from crashkit.api.reference import read_reference
@@ -453,7 +455,7 @@ class StoredLevel:
         return self.surrogate.predict_removal(parameters[list(self.order)], time)
 
 
-def as_model(surrogate: Surrogate, folder: Path, reference: Reference) -> Model:
+def as_model(surrogate: Surrogate, folder: Path, reference: Reference) -> ComparedModel:
     """A surrogate, stored in `folder`, as evaluation sees it: one predictor a level, and the runs it has seen.
 
     Raises
@@ -461,7 +463,7 @@ def as_model(surrogate: Surrogate, folder: Path, reference: Reference) -> Model:
     EvaluationError
         Where its parameters, nodes or levels are not those of the dataset.
     """
-    from evaluation.comparison.predictor import Model
+    from evaluation.comparison.predictor import ComparedModel
     from evaluation.errors import EvaluationError
 
     names = surrogate.record.ranges.names
@@ -490,7 +492,7 @@ def as_model(surrogate: Surrogate, folder: Path, reference: Reference) -> Model:
     record = surrogate.record
     configuration = surrogate.settings.model_dump(mode="json")
     configuration.pop("seed", None)
-    return Model(
+    return ComparedModel(
         name=folder.resolve().name,
         predictors=predictors,
         fitted_runs=record.fitted_runs,
@@ -535,7 +537,7 @@ def _counted(tell: Progress, what: str, total: int | None) -> Iterator[Callable[
     yield step
 
 
-def _context(dataset: Path, reference: Reference, models: Sequence[Model], split: Any) -> dict[str, str]:
+def _context(dataset: Path, reference: Reference, models: Sequence[ComparedModel], split: Any) -> dict[str, str]:
     """The methods section: what was compared, on what, with what."""
     import datetime
     import platform

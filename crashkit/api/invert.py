@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from crashkit.ingestion.measured_points import MeasuredPoints
     from surrogates.queries.misfit import Measured, Misfit
     from surrogates.queries.points import AtPoints
-    from surrogates.queries.posterior import Posterior
+    from surrogates.queries.posterior import ParameterPosterior
     from surrogates.surrogate import Surrogate
 
 # More rows add nothing to what errors of the model leave to be known, and the time grows with their square.
@@ -39,7 +39,7 @@ class Inversion:
     names, units
         Parameters of the model, and the units in which tables write them.
     posterior
-        Samples and optima, in the model's units; see `surrogates.queries.posterior.Posterior`.
+        Samples and optima, in the model's units; see `surrogates.queries.posterior.ParameterPosterior`.
     residual
         One row a measured number: row of the table, time (s), component, measured, explained (by the best parameters),
         noise (standard deviation, the model's and the measurement's): m.
@@ -52,7 +52,7 @@ class Inversion:
     names: tuple[str, ...]
     units: tuple[str, ...]
     factors: tuple[float, ...]
-    posterior: Posterior
+    posterior: ParameterPosterior
     residual: pd.DataFrame
     warnings: tuple[str, ...]
     notes: tuple[str, ...]
@@ -355,7 +355,7 @@ def _residual(
 
 
 def _warnings(
-    found: Posterior,
+    found: ParameterPosterior,
     misfit: Misfit,
     residual: pd.DataFrame,
     names: tuple[str, ...],

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crashkit.api._predicted import GivenRuns, PredictedRuns, Structure, dry_runs, true_runs
+from crashkit.api._predicted import FormulaMesh, GivenRuns, PredictedRuns, dry_runs, true_runs
 from evaluation.measures.formula import Formula, Value, read_formulas
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ class NumberJudge:
 
     def __init__(self, formulas: Mapping[str, Formula], campaign: Campaign) -> None:
         self.formulas, self.campaign = dict(formulas), campaign
-        self.structure = Structure.of_campaign(campaign)
+        self.structure = FormulaMesh.of_campaign(campaign)
         self.found: dict[str, dict[str, list[float]]] = {name: {} for name in formulas}
         self.units: dict[str, str] = {}
         self.sizes: dict[str, list[float]] = {name: [] for name in formulas}
@@ -102,7 +102,7 @@ def predicted_numbers(
     formulas = model_formulas(surrogate)
     if not formulas:
         return []
-    structure, time = Structure.of(surrogate), surrogate.record.time
+    structure, time = FormulaMesh.of(surrogate), surrogate.record.time
     runs = PredictedRuns(surrogate, structure, parameters, time, surrogate.number(level))
     out = []
     for name, formula in formulas.items():

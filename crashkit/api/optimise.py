@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from crashkit.api.model import Model
     from evaluation.measures.formula import Formula, Limit, Value
-    from surrogates.queries.optimum import Local, Problem
+    from surrogates.queries.optimum import LocalAnswer, Problem
     from surrogates.surrogate import Surrogate
 
 Floats = NDArray[np.float64]
@@ -66,7 +66,7 @@ class Optimum:
     sensitivities: pd.DataFrame
     table: pd.DataFrame
     confirm: pd.DataFrame
-    others: tuple[Local, ...]
+    others: tuple[LocalAnswer, ...]
     notes: tuple[str, ...]
 
     def save(self, folder: str | Path) -> Path:
@@ -145,7 +145,7 @@ def optimise(
     Limits are tightened by the quantile of the model's error at the answer, and the search is repeated from there until
     that changes no more (Du and Chen 2004, doi 10.1115/1.1649968, "sequential optimization and reliability assessment").
     """
-    from crashkit.api._predicted import PredictedRuns, Structure
+    from crashkit.api._predicted import FormulaMesh, PredictedRuns
     from crashkit.api.invert import known_values
     from crashkit.api.numbers import model_formulas
     from crashkit.api.predict import model_in_hand
@@ -159,7 +159,7 @@ def optimise(
         raise DataError(f"confidence {confidence}: expected a share from 0.5 to below 1, such as 0.9")
     tell = watched(report, progress)
     surrogate = model_in_hand(model).surrogate
-    ranges, structure, number = surrogate.record.ranges, Structure.of(surrogate), surrogate.number(level)
+    ranges, structure, number = surrogate.record.ranges, FormulaMesh.of(surrogate), surrogate.number(level)
     formulas = read_formulas({**{n: f.text for n, f in model_formulas(surrogate).items()}, **(numbers or {})})
     text = str(minimise if maximise is None else maximise).strip()
     goal = formulas.get(text) or read_formula(text)
@@ -191,8 +191,8 @@ def optimise(
     problem = Problem(lambda points: numbers_of(asked(points), len(points)), low, high)
     box = sampled(problem, samples, seed, lambda done: tell("points of the range", done, samples, ""))
     margins, earlier = np.zeros(len(bounds)), [np.inf]
-    found: list[Local] = []
-    plain: Local | None = None
+    found: list[LocalAnswer] = []
+    plain: LocalAnswer | None = None
     errors = np.zeros((1, len(bounds)))
     told = ""
     for turn in range(_ROUNDS):
@@ -259,7 +259,7 @@ def _excess(bound: Limit, value: Value) -> Floats:
 
 
 def _errors(
-    surrogate: Surrogate, asked: Any, numbers_of: Any, best: Local, time: Floats, level: int, seed: int
+    surrogate: Surrogate, asked: Any, numbers_of: Any, best: LocalAnswer, time: Floats, level: int, seed: int
 ) -> tuple[str, Floats]:
     """Where the model's error is taken from, and by how much draws of it move each limit's number (draw, limit)."""
     from surrogates.doubt import doubt_of
@@ -277,7 +277,7 @@ def _errors(
 
 
 def _limits(
-    bounds: Sequence[Limit], best: Local, margins: Floats, kept: Floats, scale: Floats, problem: Problem
+    bounds: Sequence[Limit], best: LocalAnswer, margins: Floats, kept: Floats, scale: Floats, problem: Problem
 ) -> pd.DataFrame:
     import pandas as pd
 
@@ -299,7 +299,7 @@ def _limits(
     )
 
 
-def _prices(problem: Problem, best: Local, active: NDArray[np.bool_], scale: Floats) -> Floats:
+def _prices(problem: Problem, best: LocalAnswer, active: NDArray[np.bool_], scale: Floats) -> Floats:
     """(limit,): multipliers of the active limits, in the number's unit per unit of the limit's; 0 for the others.
 
     At an optimum the slope of the number is a sum of those of the active limits, but for parameters at the edge.
@@ -319,7 +319,7 @@ def _prices(problem: Problem, best: Local, active: NDArray[np.bool_], scale: Flo
 
 
 def _table(
-    names: Sequence[str], units: Sequence[str], factors: Floats, best: Local, low: Floats, high: Floats
+    names: Sequence[str], units: Sequence[str], factors: Floats, best: LocalAnswer, low: Floats, high: Floats
 ) -> pd.DataFrame:
     import pandas as pd
 
@@ -352,8 +352,8 @@ def _confirm(
     names: Sequence[str],
     units: Sequence[str],
     factors: Floats,
-    found: Sequence[Local],
-    plain: Local,
+    found: Sequence[LocalAnswer],
+    plain: LocalAnswer,
     low: Floats,
     high: Floats,
     count: int,

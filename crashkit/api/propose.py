@@ -102,14 +102,14 @@ def _most_useful(
     """The points that lower the error over the box most, by a process trained on all runs; and what is expected of them."""
     import tempfile
 
-    from crashkit.api._design import Known
+    from crashkit.api._design import TrainedProcess
     from crashkit.api.train import train
 
     mirrored = sorted({*odd, *(n for n, r in box.parameters.items() if r.odd)})
     settings = [f"physics.odd=[{', '.join(mirrored)}]"] if mirrored else []
     with tempfile.TemporaryDirectory(prefix="crashkit-propose-") as folder:
         surrogate = train(dataset, Path(folder) / "model", "pod-gpr", settings=settings, seed=seed).surrogate
-    known = Known.of(surrogate, box)
+    known = TrainedProcess.of(surrogate, box)
     points, share = known.best(known.of_runs(_parameters(dataset)), count, seed)
     error = known.judge(0.9, seed).error
     return points, {"expected_error_m": error, "expected_error_after_m": error * share}

@@ -228,7 +228,7 @@ _FEWEST = 8
 
 def _train_and_judge(campaign: Campaign, confidence: float) -> tuple[Judgement, float, NDArray[np.float64]]:
     """The error over the box by a process on all runs, what it is expected to be after the next batch, and that batch."""
-    from crashkit.api._design import Known
+    from crashkit.api._design import TrainedProcess
     from crashkit.api.train import train
 
     plan = campaign.plan
@@ -238,7 +238,7 @@ def _train_and_judge(campaign: Campaign, confidence: float) -> tuple[Judgement, 
         campaign.dataset, campaign.folder / "process", "pod-gpr", settings=told, seed=plan.design.seed,
         overwrite=True,
     ).surrogate  # fmt: skip
-    known = Known.of(surrogate, plan)
+    known = TrainedProcess.of(surrogate, plan)
     judged = known.judge(confidence, plan.design.seed)
     computed = campaign.points("done")
     seed = plan.design.seed + 1000 * len(computed)

@@ -14,7 +14,7 @@ from crashkit.display import watched
 from data_schema.progress import Progress
 
 if TYPE_CHECKING:
-    from crashkit.api._predicted import Structure
+    from crashkit.api._predicted import FormulaMesh
     from crashkit.api.model import Model
     from evaluation.measures.formula import Formula, Limit
     from evaluation.scatter.draws import Plan, Scatter, Shape
@@ -101,7 +101,7 @@ def scatter(
     from crashkit.extras import need
 
     need("a scatter", "train", "report")
-    from crashkit.api._predicted import Structure
+    from crashkit.api._predicted import FormulaMesh
     from crashkit.api.numbers import model_formulas
     from crashkit.api.predict import model_in_hand
     from crashkit.output import complete_folder, refuse_earlier
@@ -113,7 +113,7 @@ def scatter(
     tell = watched(report, progress)
     trained = model_in_hand(model)
     surrogate = trained.surrogate
-    structure = Structure.of(surrogate)
+    structure = FormulaMesh.of(surrogate)
     number = surrogate.number(level)
     nominal, scatters = _scatters(surrogate.record.ranges, vary, at or {}, shape)
     known = {name: formula.text for name, formula in model_formulas(surrogate).items()}
@@ -135,7 +135,7 @@ class _Study:
     def __init__(
         self,
         surrogate: Surrogate,
-        structure: Structure,
+        structure: FormulaMesh,
         nominal: Floats,
         scatters: Sequence[Scatter],
         formulas: Mapping[str, Formula],
@@ -385,7 +385,7 @@ def _outside(ranges: Ranges, scatters: Sequence[Scatter], inside: NDArray[np.boo
     return tuple(out)
 
 
-def _groups(structure: Structure, position: Floats) -> tuple[dict[str, NDArray[np.int64]], NDArray[np.int64]]:
+def _groups(structure: FormulaMesh, position: Floats) -> tuple[dict[str, NDArray[np.int64]], NDArray[np.int64]]:
     """Places of each part's nodes among some kept nodes, and these; boxes of the structure where there is one part."""
     from evaluation.measures.regions import by_grid
 
@@ -401,7 +401,7 @@ def _groups(structure: Structure, position: Floats) -> tuple[dict[str, NDArray[n
     return {name: np.searchsorted(kept, nodes) for name, nodes in some.items()}, kept
 
 
-def _nodes(formula: Formula, structure: Structure) -> NDArray[np.int64] | None:
+def _nodes(formula: Formula, structure: FormulaMesh) -> NDArray[np.int64] | None:
     """The nodes that a formula speaks of; None: all."""
     return formula.nodes(structure.parts, structure.nodes)
 

@@ -30,7 +30,7 @@ from crashkit.campaign.box import CampaignError
 from crashkit.campaign.deck import arguments, check_template, program_of, template_files, write_deck
 from crashkit.campaign.executors import Executor, Local, Slurm
 from crashkit.campaign.plan import Plan, read_plan
-from crashkit.campaign.table import Run, Table
+from crashkit.campaign.table import RunRow, Table
 from data_schema.progress import Progress, silent
 from data_schema.replace import beside
 
@@ -107,7 +107,7 @@ class Campaign:
         new = [row for k, row in enumerate(rows) if tuple(row) not in known and row not in rows[:k]]
         return self.table.add([dict(zip(self.plan.names, row, strict=True)) for row in new], origin)
 
-    def compute(self, report: Progress | None = None) -> list[Run]:
+    def compute(self, report: Progress | None = None) -> list[RunRow]:
         """Compute all waiting runs, a limited number at a time, and return the runs that were decided on the way.
 
         Runs that a killed campaign left running are picked up. Ctrl-C stops the jobs; their runs wait again.
@@ -168,7 +168,7 @@ class Campaign:
 
     # ------------------------------------------------------------------------------------------------- one run
 
-    def _start(self, run: Run) -> None:
+    def _start(self, run: RunRow) -> None:
         """Make the run's folder and deck, and start its job."""
         place = self._place(run)
         try:
@@ -191,7 +191,7 @@ class Campaign:
             ) from error
         self.table.change(run.name, "running", handle=handle)
 
-    def _settle(self) -> list[Run]:
+    def _settle(self) -> list[RunRow]:
         """Decide on running runs that have ended; returns those that go on."""
         going = []
         for run in self.table.runs("running"):
@@ -215,7 +215,7 @@ class Campaign:
             )
         return going
 
-    def _judged(self, run: Run, ended: job.Ended | None) -> tuple[str, str, dict[str, float]]:
+    def _judged(self, run: RunRow, ended: job.Ended | None) -> tuple[str, str, dict[str, float]]:
         """State, reason and quality of a run that is over."""
         place = self._place(run)
         if ended is None:
@@ -243,7 +243,7 @@ class Campaign:
         wrong = replace(verdict, ended=None).beyond(self.plan.quality.model_dump())
         return ("refused", wrong[0], found) if wrong else ("done", "", found)
 
-    def _quality(self, run: Run) -> quality.Quality:
+    def _quality(self, run: RunRow) -> quality.Quality:
         """What the solver printed, and what its time histories know better where they can be read."""
         from crashkit.errors import ReadError
         from crashkit.readers import reader_for
@@ -256,7 +256,7 @@ class Campaign:
         except (ReadError, StopIteration):
             return printed
 
-    def _wrote(self, run: Run) -> bool:
+    def _wrote(self, run: RunRow) -> bool:
         """Whether the solver left something that ingest can read."""
         place = self._place(run)
         if self.plan.results:
@@ -270,12 +270,12 @@ class Campaign:
             return False
         return True
 
-    def _result(self, run: Run) -> Path:
+    def _result(self, run: RunRow) -> Path:
         place = self._place(run)
         found = sorted(place.glob(self.plan.results)) if self.plan.results else []
         return found[0] if len(found) == 1 and found[0].is_dir() else place
 
-    def _place(self, run: Run) -> Path:
+    def _place(self, run: RunRow) -> Path:
         return self.folder.resolve() / "runs" / run.name
 
     def _values(self, parameters: Mapping[str, float], name: str) -> dict[str, Any]:

@@ -55,7 +55,7 @@ class Finished(_Strict):
     text: str
 
 
-class Quality(_Strict):
+class QualityLimits(_Strict):
     """Limits of a run, in per cent; a run beyond one of them is refused. None: no limit."""
 
     energy_error: float | None = Field(LIMITS["energy_error"], gt=0)
@@ -121,7 +121,7 @@ class Plan(Box):
     command: Command
     results: str = ""
     finished: Finished | None = None
-    quality: Quality = Quality.model_validate({})
+    quality: QualityLimits = QualityLimits.model_validate({})
     at_a_time: int = Field(1, ge=1)
     timeout: Duration = 24 * 3600.0
     retries: int = Field(0, ge=0)

@@ -33,7 +33,7 @@ CREATE TABLE IF NOT EXISTS about (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 
 
 @dataclass(frozen=True)
-class Run:
+class RunRow:
     """One row: parameters by name in the units of the box, its state, and how it went."""
 
     number: int
@@ -69,11 +69,11 @@ class Table:
     def close(self) -> None:
         self._db.close()
 
-    def runs(self, *states: str) -> list[Run]:
+    def runs(self, *states: str) -> list[RunRow]:
         """All runs by number, or those in one of `states`."""
         rows = self._db.execute("SELECT * FROM run ORDER BY number").fetchall()
         out = [
-            Run(**{**dict(row), **{k: json.loads(row[k] or "{}") for k in ("parameters", "handle", "quality")}})
+            RunRow(**{**dict(row), **{k: json.loads(row[k] or "{}") for k in ("parameters", "handle", "quality")}})
             for row in rows
         ]
         return [r for r in out if not states or r.state in states]

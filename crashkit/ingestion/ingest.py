@@ -23,7 +23,7 @@ from crashkit.display import Described, Facts, Rows, listed, watched
 from crashkit.errors import CrashkitError, DataError, OutputError, ReadError
 from crashkit.ingestion.alignment import common_time, reach, same_time
 from crashkit.ingestion.assembly import Existing, publish
-from crashkit.ingestion.scale import Scale
+from crashkit.ingestion.scale import CampaignScale
 from crashkit.ingestion.staging import BackgroundHashes, StagedRun, Staging, key_of
 from crashkit.ingestion.store import check_output, recover
 from crashkit.ingestion.structure import Structure
@@ -81,7 +81,7 @@ class IngestSummary(Described):
     notes: tuple[str, ...] = ()
     nodes: int = 0
     states: int = 0
-    scale: Scale | None = None
+    scale: CampaignScale | None = None
     question: str = ""
 
     def _facts(self) -> tuple[str, Facts, Sequence[str], Rows]:
@@ -491,10 +491,10 @@ def _note_lost_end(time: NDArray[np.float64], runs: Sequence[Found], look: Surve
         )
 
 
-def _scale_of(fresh: Sequence[Found], staged: Mapping[str, StagedRun], layout: Layout) -> Scale:
+def _scale_of(fresh: Sequence[Found], staged: Mapping[str, StagedRun], layout: Layout) -> CampaignScale:
     """Size, duration, displacement and speed of the runs that were read now."""
     size = np.ptp(layout.structure.position, axis=0)
-    return Scale(
+    return CampaignScale(
         size=(float(size[0]), float(size[1]), float(size[2])),
         duration=max(float(f.time[-1] - f.time[0]) for f in fresh),
         displacement=max(staged[f.name].displacement for f in fresh),

@@ -17,7 +17,7 @@ _FASTEST = 3e3
 
 
 @dataclass(frozen=True)
-class Scale:
+class CampaignScale:
     """The largest of all runs, SI: `size` along x, y and z, m; `duration`, s; `displacement`, m; `speed`, m/s."""
 
     size: tuple[float, float, float]

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crashkit.errors import DataError, OutputError, ReadError
-from crashkit.writers.paraview_view import Ranges, view_script
+from crashkit.writers.paraview_view import ValueRanges, view_script
 from data_schema.replace import put_in_place, room_beside
 
 if TYPE_CHECKING:
@@ -400,7 +400,7 @@ def _write(
     if target.is_dir():
         raise OutputError(f"{target}: is a folder: expected the name of a file")
     constant = _checked(constant, mesh, "the constant arrays")
-    ranges = Ranges()
+    ranges = ValueRanges()
     ranges.note(constant.point_data, constant.cell_data)
     steps = _followed(_in_step(states, constant, mesh, times, deform), ranges)
     with _output(target) as folder:
@@ -422,7 +422,7 @@ def _write(
     return [target, *others, script]
 
 
-def _followed(steps: _Steps, ranges: Ranges) -> _Steps:
+def _followed(steps: _Steps, ranges: ValueRanges) -> _Steps:
     """`steps` as they are, and the ranges of what goes by are noted."""
     for state, points in steps:
         ranges.note(state.point_data, state.cell_data)

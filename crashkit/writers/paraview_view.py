@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 
 @dataclass
-class Ranges:
+class ValueRanges:
     """Smallest and largest value of arrays over all states, of vectors of their length.
 
     Attributes
@@ -47,7 +47,7 @@ class Ranges:
             self.vectors.append(name)
 
 
-def view_script(name: str, ranges: Ranges, units: Mapping[str, str]) -> str:
+def view_script(name: str, ranges: ValueRanges, units: Mapping[str, str]) -> str:
     """A Python script for ParaView that shows the file `name`, which lies beside it.
 
     All names stand in it as Python literals: whoever named an array or a unit cannot make the script do anything else.

@@ -65,7 +65,7 @@ class Banded(Protocol):
 
 
 @dataclass(frozen=True)
-class Model:
+class ComparedModel:
     """A trained model: one predictor for each level it can answer on, finest first, and what it has seen.
 
     Attributes
@@ -108,7 +108,7 @@ class Model:
     hard: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
-def array_names(models: Sequence[Model]) -> dict[tuple[str, str], str]:
+def array_names(models: Sequence[ComparedModel]) -> dict[tuple[str, str], str]:
     """(model, predictor) -> what its arrays are called: the predictor, and the model where two models have it."""
     every = [p.name for m in models for p in m.predictors]
     return {

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from crashkit.display import Described, Facts, Rows, listed
 from data_schema.pod import Pod, StreamedPod
 from evaluation.comparison.beside import Beside
-from evaluation.comparison.predictor import Model, Predictor
+from evaluation.comparison.predictor import ComparedModel, Predictor
 from evaluation.comparison.reference import Reference
 from evaluation.comparison.scoring import Key, RunScores, Scores, full_field, gather, mesh_of, score_run
 from evaluation.comparison.sensors import Sensors, choose_sensors
@@ -59,7 +59,7 @@ class Evaluation(Described):
     """
 
     reference: Reference
-    models: tuple[Model, ...]
+    models: tuple[ComparedModel, ...]
     entries: tuple[Entry, ...]
     split: Split
     scores: Mapping[str, Scores]
@@ -93,11 +93,11 @@ class Evaluation(Described):
         return self.models[model].predictors[number]
 
     @property
-    def first_seeds(self) -> list[Model]:
+    def first_seeds(self) -> list[ComparedModel]:
         """One model a row: further seeds are not drawn or written."""
         return [self.models[m] for m in sorted({entry.keys[0][0] for entry in self.entries})]
 
-    def model(self, entry: Entry, seed: int = 0) -> Model:
+    def model(self, entry: Entry, seed: int = 0) -> ComparedModel:
         """The model that one seed of `entry` belongs to."""
         return self.models[entry.keys[seed][0]]
 
@@ -155,7 +155,7 @@ class Evaluation(Described):
         return tuple(best.values())
 
 
-def predictors_of(models: Sequence[Model]) -> dict[Key, Predictor]:
+def predictors_of(models: Sequence[ComparedModel]) -> dict[Key, Predictor]:
     """Every predictor of every model under its two numbers."""
     return {(m, p): predictor for m, model in enumerate(models) for p, predictor in enumerate(model.predictors)}
 
@@ -198,7 +198,7 @@ def default_groups(reference: Reference) -> tuple[Groups, dict[str, tuple[str, .
 
 def compare(
     reference: Reference,
-    models: Sequence[Model],
+    models: Sequence[ComparedModel],
     split: Split,
     *,
     seeds_as_spread: bool = True,

@@ -12,7 +12,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from evaluation.comparison.predictor import Model, Predictor
+from evaluation.comparison.predictor import ComparedModel, Predictor
 from evaluation.comparison.reference import Reference
 from evaluation.comparison.scoring import Key
 from evaluation.errors import EvaluationError
@@ -45,7 +45,7 @@ class Split:
     test: tuple[int, ...]
 
 
-def agree_on_split(reference: Reference, models: Sequence[Model], test: Sequence[str] | None = None) -> Split:
+def agree_on_split(reference: Reference, models: Sequence[ComparedModel], test: Sequence[str] | None = None) -> Split:
     """The test runs: those asked for, else those that all models hold out.
 
     Raises
@@ -80,7 +80,7 @@ def agree_on_split(reference: Reference, models: Sequence[Model], test: Sequence
     return Split(tuple(k for k in range(len(reference.runs)) if k not in taken), numbers)
 
 
-def _held_out(models: Sequence[Model]) -> tuple[str, ...]:
+def _held_out(models: Sequence[ComparedModel]) -> tuple[str, ...]:
     first = models[0]
     for model in models[1:]:
         if set(model.held_out_runs) != set(first.held_out_runs):
@@ -91,7 +91,7 @@ def _held_out(models: Sequence[Model]) -> tuple[str, ...]:
     return first.held_out_runs
 
 
-def _count(model: Model) -> str:
+def _count(model: ComparedModel) -> str:
     runs = model.held_out_runs
     return f"{len(runs)} runs ({_some(runs)})" if runs else "no runs"
 
@@ -105,7 +105,7 @@ def _without_seed(name: str) -> str:
     return re.sub(r"[-_. ]*(seed|s)?[-_. ]*\d+$", "", name) or name
 
 
-def entries(models: Sequence[Model], seeds_as_spread: bool = True) -> tuple[Entry, ...]:
+def entries(models: Sequence[ComparedModel], seeds_as_spread: bool = True) -> tuple[Entry, ...]:
     """The rows of the comparison, in the order the models were given.
 
     Models of equal configuration that differ in nothing but the seed become one row with a spread; otherwise equal

@@ -21,7 +21,7 @@ _LOSSES = ("total", "approximation", "reconstruction")
 
 
 @dataclass(frozen=True)
-class History:
+class LossCurves:
     """curves: model -> name of a loss -> (epoch,) values of the scaled data, so without unit."""
 
     curves: Mapping[str, Mapping[str, NDArray[np.float64]]]
@@ -76,7 +76,7 @@ def _rises(total: NDArray[np.float64]) -> bool:
     return bool(smooth[-1] > 1.1 * smooth.min())
 
 
-def select(evaluation: Evaluation) -> History | None:
+def select(evaluation: Evaluation) -> LossCurves | None:
     curves = {
         e.label: {k: np.asarray(v, dtype=np.float64) for k, v in evaluation.predictor(e).history.items()}
         for e in evaluation.entries
@@ -84,7 +84,7 @@ def select(evaluation: Evaluation) -> History | None:
     }
     curves = {m: {k: v for k, v in c.items() if k in _LOSSES and v.size} for m, c in curves.items()}
     curves = {m: c for m, c in curves.items() if c}
-    return History(curves) if curves else None
+    return LossCurves(curves) if curves else None
 
 
 FIGURE = Kind("history", "Training history", select)

@@ -10,7 +10,7 @@ import numpy as np
 
 from evaluation.drawing.style import INK, MS, Sheet, called, leading
 from evaluation.figures.kind import Columns, Kind
-from evaluation.measures.curves import Curve, curves, shown, unit
+from evaluation.measures.curves import ProbeCurve, curves, shown, unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,8 +27,8 @@ class Probes:
 
     run: str
     nodes: tuple[int, ...]
-    truth: Curve
-    predictions: Mapping[str, Curve]
+    truth: ProbeCurve
+    predictions: Mapping[str, ProbeCurve]
     shown: tuple[str, ...]
 
     def numbers(self) -> Columns:

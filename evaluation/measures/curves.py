@@ -21,7 +21,7 @@ _TO_SHOWN = {"displacement": (100.0, "cm"), "velocity": (1.0, "m/s"), "accelerat
 
 
 @dataclass(frozen=True)
-class Curve:
+class ProbeCurve:
     """Resultants (state, probe) of one run: m, m/s and m/s2, at `time` (state,), s.
 
     Where the states allow no filter class, `cfc` is None, velocity is as it comes out of the differences, and there is
@@ -54,7 +54,7 @@ class Curve:
         return QUANTITIES if self.acceleration is not None else QUANTITIES[:2]
 
 
-def curves(time: NDArray[np.float64], displacement: NDArray[np.floating]) -> Curve:
+def curves(time: NDArray[np.float64], displacement: NDArray[np.floating]) -> ProbeCurve:
     """Resultant curves of probes: time (state,) s, displacement (state, probe, 3) m; at least four states."""
     cfc = filter_class(time)
     seen = probe_histories(time, displacement, np.arange(displacement.shape[1]))
@@ -65,7 +65,7 @@ def curves(time: NDArray[np.float64], displacement: NDArray[np.floating]) -> Cur
 
     inner = slice(_ENDS, len(time) - _ENDS)
     enough = cfc is not None and len(time) >= 2 * _ENDS + 4
-    return Curve(
+    return ProbeCurve(
         time,
         np.linalg.norm(seen.displacement, axis=-1),
         resultant(seen.velocity, time),
@@ -138,7 +138,7 @@ def keep_compiled() -> None:
             getattr(importlib.import_module(module), name).enable_caching()
 
 
-def _rating(truth: Curve, mine: Curve, quantity: str, probe: int) -> float:
+def _rating(truth: ProbeCurve, mine: ProbeCurve, quantity: str, probe: int) -> float:
     times, expected = truth.of(quantity)
     try:
         return rate(times, expected[:, probe], mine.of(quantity)[1][:, probe]).overall

@@ -41,7 +41,7 @@ _NAMED: Mapping[str, Powers] = {
 }  # fmt: skip
 
 
-class Runs(Protocol):
+class FormulaRuns(Protocol):
     """What a formula asks of runs, all of which have the same mesh and times."""
 
     @property
@@ -122,7 +122,7 @@ class Formula:
                 return part_nodes(parts, words["part"]) if "part" in words else None
         return None
 
-    def value(self, runs: Runs, others: Mapping[str, Formula] | None = None) -> Value:
+    def value(self, runs: FormulaRuns, others: Mapping[str, Formula] | None = None) -> Value:
         """What it gives for `runs`.
 
         Parameters
@@ -137,7 +137,7 @@ class Formula:
         """
         return _Walk(self, runs, dict(others or {})).of(self.tree)
 
-    def number(self, runs: Runs, others: Mapping[str, Formula] | None = None) -> Value:
+    def number(self, runs: FormulaRuns, others: Mapping[str, Formula] | None = None) -> Value:
         """The same, and it must be one number a run.
 
         Raises
@@ -381,7 +381,7 @@ def _no_circle(name: str, formulas: Mapping[str, Formula], above: tuple[str, ...
 @dataclass
 class _Walk:
     formula: Formula
-    runs: Runs
+    runs: FormulaRuns
     others: dict[str, Formula]
 
     def of(self, node: ast.expr) -> Value:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from crashkit.output import file_name
 from crashkit.writers.paraview import rounded, write_paraview
 from data_schema.edges import without_sides
-from evaluation.comparison.predictor import Model, Predictor, array_names
+from evaluation.comparison.predictor import ComparedModel, Predictor, array_names
 from evaluation.comparison.reference import Reference
 from evaluation.comparison.result import Evaluation
 from evaluation.comparison.scoring import contributions, full_field, mesh_of
@@ -102,7 +102,7 @@ def _step(reference: Reference) -> int:
 
 def _write_full(
     reference: Reference,
-    models: Sequence[Model],
+    models: Sequence[ComparedModel],
     run: int,
     truth: NDArray[np.float32],
     path: Path,
@@ -151,7 +151,7 @@ def _write_full(
 
 def _write_coarse(
     reference: Reference,
-    model: Model,
+    model: ComparedModel,
     predictor: Predictor,
     run: int,
     truth: NDArray[np.float32],

@@ -42,7 +42,7 @@ class ShownView:
 
 
 @dataclass(frozen=True)
-class Column:
+class TableColumn:
     name: str
     text: bool
 
@@ -57,7 +57,7 @@ class Cell:
 @dataclass(frozen=True)
 class ShownTable:
     title: str
-    columns: tuple[Column, ...]
+    columns: tuple[TableColumn, ...]
     rows: tuple[tuple[Cell, ...], ...]
     note: str = ""
 
@@ -151,7 +151,7 @@ def show_table(
         )
         for k in range(count)
     )
-    return ShownTable(title, tuple(Column(headings[n], textual[n]) for n in shown), rows, note)
+    return ShownTable(title, tuple(TableColumn(headings[n], textual[n]) for n in shown), rows, note)
 
 
 def _readable_column(name: str, values: Sequence[Any]) -> tuple[str, Sequence[Any]]:

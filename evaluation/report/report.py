@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluation.comparison.predictor import Model
+from evaluation.comparison.predictor import ComparedModel
 from evaluation.comparison.result import Evaluation
 from evaluation.drawing.style import CM, called
 from evaluation.errors import EvaluationError
@@ -264,12 +264,12 @@ def _details(evaluation: Evaluation) -> list[tuple[str, str]]:
     """Each configuration once, as `crashkit train --config` reads it, under the models that have it."""
     import yaml
 
-    alike: dict[str, list[Model]] = {}
+    alike: dict[str, list[ComparedModel]] = {}
     for model in evaluation.models:
         text = yaml.safe_dump(plain_json(dict(model.configuration)), default_flow_style=None, width=100)
         alike.setdefault(text, []).append(model)
     return [(f"Configuration of {', '.join(map(_with_seed, models))}", text) for text, models in alike.items()]
 
 
-def _with_seed(model: Model) -> str:
+def _with_seed(model: ComparedModel) -> str:
     return model.name if model.seed is None else f"{model.name} (seed {model.seed})"

@@ -54,7 +54,7 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class Local:
+class LocalAnswer:
     """A local answer: parameters (parameter,), the number, the excess (limit,), and whether all bounds are kept."""
 
     parameters: Floats
@@ -90,7 +90,7 @@ def sampled(problem: Problem, count: int, seed: int, report: Callable[[int], Non
     return Sampled(points, np.concatenate(found))
 
 
-def search(problem: Problem, known: Sampled, shift: Floats, starts: int, extra: list[Floats]) -> list[Local]:
+def search(problem: Problem, known: Sampled, shift: Floats, starts: int, extra: list[Floats]) -> list[LocalAnswer]:
     """Local answers, the best first: those that keep all bounds by their value, then the others by their excess.
 
     Parameters
@@ -111,7 +111,7 @@ def search(problem: Problem, known: Sampled, shift: Floats, starts: int, extra: 
     ends = [_descend(problem, scale, shift, start) for start in [*extra, *_starts(known, scale, shift, starts)]]
     span = np.where(problem.free, problem.high - problem.low, 1.0)
     ends.sort(key=lambda e: (not e.kept, e.value if e.kept else float(_beyond(e.excess + shift, scale).max())))
-    out: list[Local] = []
+    out: list[LocalAnswer] = []
     for end in ends:
         if all(np.abs((end.parameters - o.parameters) / span).max() > _SAME for o in out):
             out.append(end)
@@ -135,7 +135,7 @@ def _beyond(excess: Floats, scale: Floats) -> Floats:
     return np.asarray(np.maximum(excess, 0) / scale[1:])
 
 
-def _descend(problem: Problem, scale: Floats, shift: Floats, start: Floats) -> Local:
+def _descend(problem: Problem, scale: Floats, shift: Floats, start: Floats) -> LocalAnswer:
     from scipy.optimize import minimize
 
     free = problem.free
@@ -169,6 +169,6 @@ def _descend(problem: Problem, scale: Floats, shift: Floats, start: Floats) -> L
         ).x  # fmt: skip
         end = again if at(again)[0][1:].max() < at(end)[0][1:].max() else end
     found = at(end)[0] * scale - np.concatenate([[0.0], shift])
-    return Local(
+    return LocalAnswer(
         problem.whole(np.clip(end, 0, 1)[None])[0], float(found[0]), found[1:], bool((at(end)[0][1:] <= _KEPT).all())
     )

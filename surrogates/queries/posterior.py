@@ -45,7 +45,7 @@ class Explanation:
 
 
 @dataclass(frozen=True)
-class Posterior:
+class ParameterPosterior:
     """Parameters as an even prior over the box and the density leave them.
 
     Attributes
@@ -108,7 +108,7 @@ def posterior(
     samples: int = 4000,
     seed: int = 0,
     starts: int = 12,
-) -> Posterior:
+) -> ParameterPosterior:
     """The posterior over the box from `low` to `high` (parameter,); parameters with low == high are known.
 
     Optima are sought from `starts` samples.
@@ -129,7 +129,7 @@ def posterior(
     )
     values = density(drawn)
     found = _explanations(density, drawn, values, low, high, starts)
-    return Posterior(drawn, values, found, low, high)
+    return ParameterPosterior(drawn, values, found, low, high)
 
 
 def _by_cells(

@@ -20,7 +20,7 @@ BAND_HOLDS = 0.85
 
 
 @dataclass(frozen=True)
-class Held:
+class BandCheck:
     """The share of nodes and states within the band, and on how many test runs."""
 
     share: float
@@ -33,17 +33,17 @@ class Held:
         return text if self.share >= BAND_HOLDS else f"{text}: it is too narrow, do not take it for the error"
 
 
-def note_held(folder: Path, held: Mapping[str, Held]) -> None:
+def note_held(folder: Path, held: Mapping[str, BandCheck]) -> None:
     """Note what was held by level, such as "MH1", beside the model in `folder`; where that cannot be written, do without."""
     with contextlib.suppress(OSError), beside(folder / _FILE) as new:
         new.write_text(json.dumps({level: asdict(value) for level, value in held.items()}), encoding="utf-8")
 
 
-def held_on_tests(folder: Path) -> Mapping[str, Held]:
+def held_on_tests(folder: Path) -> Mapping[str, BandCheck]:
     """What was noted, by level; empty where nothing was, or nothing that can be."""
     try:
         noted = json.loads((folder / _FILE).read_text(encoding="utf-8"))
-        found = {str(level): Held(float(v["share"]), int(v["runs"])) for level, v in noted.items()}
+        found = {str(level): BandCheck(float(v["share"]), int(v["runs"])) for level, v in noted.items()}
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return {}
     return {level: held for level, held in found.items() if 0 <= held.share <= 1 and held.runs > 0}

@@ -12,7 +12,7 @@ from toy import NearestPod
 
 from crashkit.dataset import demo_data
 from crashkit.mesh.hierarchy import build_hierarchy
-from evaluation.comparison.predictor import Model
+from evaluation.comparison.predictor import ComparedModel
 from evaluation.comparison.reference import Reference
 from evaluation.comparison.result import Evaluation, compare
 from evaluation.comparison.sensors import choose_sensors
@@ -65,7 +65,7 @@ def make_predictor(reference: Reference) -> Callable[..., NearestPod]:
 
 
 @pytest.fixture(scope="session")
-def models(reference: Reference, make_predictor: Callable[..., NearestPod]) -> tuple[Model, ...]:
+def models(reference: Reference, make_predictor: Callable[..., NearestPod]) -> tuple[ComparedModel, ...]:
     seen = {
         "fitted_runs": reference.runs[:8],
         "tuned_runs": reference.runs[8:9],
@@ -74,9 +74,9 @@ def models(reference: Reference, make_predictor: Callable[..., NearestPod]) -> t
     }
     cascade = tuple(make_predictor(f"MH{level}", level, 8 - level) for level in (1, 2, 3))
     return (
-        Model("mh", cascade, **seen, seed=0, configuration={"model": "mh"}),
-        Model("podnn", (make_predictor("PODNN", 0, 4),), **seen, seed=0, configuration={"model": "podnn"}),
-        Model(
+        ComparedModel("mh", cascade, **seen, seed=0, configuration={"model": "mh"}),
+        ComparedModel("podnn", (make_predictor("PODNN", 0, 4),), **seen, seed=0, configuration={"model": "podnn"}),
+        ComparedModel(
             "gpr",
             (make_predictor("POD-GPR", 0, 8),),
             **seen,
@@ -87,7 +87,7 @@ def models(reference: Reference, make_predictor: Callable[..., NearestPod]) -> t
 
 
 @pytest.fixture(scope="session")
-def evaluation(reference: Reference, models: tuple[Model, ...]) -> Evaluation:
+def evaluation(reference: Reference, models: tuple[ComparedModel, ...]) -> Evaluation:
     context = {"Dataset": "kart.zarr", "Machine": "a test"}
     split, sensors = agree_on_split(reference, models), choose_sensors(reference, probes=[1, 900])
     return compare(reference, models, split, context=context, sensors=sensors)

@@ -11,7 +11,7 @@ import xarray as xr
 
 import crashkit
 from crashkit.dataset import demo_data
-from surrogates.storage.tested import Held, held_on_tests
+from surrogates.storage.tested import BandCheck, held_on_tests
 
 FEW = {"level": {"epochs": 2, "channels": [3]}}
 ASKED = {"impact_speed": 22.0, "impact_angle": "10 deg", "yield_stress": "350MPa"}
@@ -70,7 +70,7 @@ def test_several_models_in_hand_or_stored_are_compared(runs: xr.Dataset, model: 
     assert sorted(result.scores) == ["MH1", "MH2", "PODNN"]
     assert (tmp_path / "report" / "report.html").exists()
     held = held_on_tests(tmp_path / "podnn")
-    assert held == {"PODNN": Held(float(result.scores["PODNN"].covered.mean()), 2)}
+    assert held == {"PODNN": BandCheck(float(result.scores["PODNN"].covered.mean()), 2)}
     again = crashkit.evaluate(runs, [model, other])
     np.testing.assert_array_equal(result.scores["PODNN"].e2, again.scores["PODNN"].e2)
 

@@ -31,7 +31,7 @@ from crashkit.writers.paraview import read_state
 from data_schema.levels import Level
 from surrogates.settings import settings
 from surrogates.storage.folder import load
-from surrogates.storage.tested import Held, note_held
+from surrogates.storage.tested import BandCheck, note_held
 from surrogates.surrogate import Surrogate
 from surrogates.training.train import train_surrogate
 
@@ -261,7 +261,7 @@ def test_bands_and_sensitivities_are_written_beside_the_prediction(crash: Path, 
     widths = surrogate.band(0.8, full=True, parameters=np.array([20.0, 5.0, 4e8]))
     assert told_band["band"]["mean_half_width_m"] == pytest.approx(float(widths.mean()), rel=1e-4)
     assert told_band["band"]["runs_behind"] == surrogate.bands[1, True].runs
-    note_held(tmp_path / "m", {"MH1": Held(0.5, 3)})
+    note_held(tmp_path / "m", {"MH1": BandCheck(0.5, 3)})
     err = run(*asked(tmp_path / "m"), "--full", "--band", 0.8, "-o", tmp_path / "again.npz")[2]
     assert "band: 80 % of nodes and states within" in err
     assert "on 3 test runs the 90 % band held 50 % of nodes and states: it is too narrow" in err

@@ -11,7 +11,7 @@ from memory_runs import MemoryRun, RunsInMemory, plate
 from crashkit.dataset import open_dataset
 from crashkit.errors import DataError
 from crashkit.ingestion.ingest import IngestSummary, ingest
-from crashkit.ingestion.scale import Scale
+from crashkit.ingestion.scale import CampaignScale
 
 
 @pytest.fixture(autouse=True)
@@ -48,17 +48,17 @@ def test_a_dead_node_has_no_speed(tmp_path: Path, memory: RunsInMemory) -> None:
 @pytest.mark.parametrize(
     ("scale", "units", "told"),
     [
-        (Scale((1500, 900, 400), 30.0, 400, 20), "SI", "a structure of 1.5e+03 m and 30 s are unusual: is --units SI right? "
+        (CampaignScale((1500, 900, 400), 30.0, 400, 20), "SI", "a structure of 1.5e+03 m and 30 s are unusual: is --units SI right? "
          "if not, the numbers fit mm-ms-kg"),
-        (Scale((1.5, 0.9, 0.4), 0.03, 0.4, 2e4), "SI", "a speed of 2e+04 m/s is unusual"),
-        (Scale((1500, 900, 400), 0.03, 400, 15000), "SI", "the numbers fit mm-s-t"),
-        (Scale((1.5e-3, 9e-4, 4e-4), 3e-5, 4e-4, 15), "mm-ms-kg", ""),
-        (Scale((1.5e-6, 9e-7, 4e-7), 3e-5, 4e-7, 15e-3), "mm-ms-kg", "a structure of 1.5e-06 m is unusual"),
-        (Scale((1.5, 0.9, 0.4), 0.03, 0.4, 15), "mm-ms-kg", ""),
-        (Scale((1.5, 0.9, 0.4), 0.0, 0.4, 0.0), "SI", ""),
+        (CampaignScale((1.5, 0.9, 0.4), 0.03, 0.4, 2e4), "SI", "a speed of 2e+04 m/s is unusual"),
+        (CampaignScale((1500, 900, 400), 0.03, 400, 15000), "SI", "the numbers fit mm-s-t"),
+        (CampaignScale((1.5e-3, 9e-4, 4e-4), 3e-5, 4e-4, 15), "mm-ms-kg", ""),
+        (CampaignScale((1.5e-6, 9e-7, 4e-7), 3e-5, 4e-7, 15e-3), "mm-ms-kg", "a structure of 1.5e-06 m is unusual"),
+        (CampaignScale((1.5, 0.9, 0.4), 0.03, 0.4, 15), "mm-ms-kg", ""),
+        (CampaignScale((1.5, 0.9, 0.4), 0.0, 0.4, 0.0), "SI", ""),
     ],
 )  # fmt: skip
-def test_absurd_numbers_ask_for_the_units(scale: Scale, units: str, told: str) -> None:
+def test_absurd_numbers_ask_for_the_units(scale: CampaignScale, units: str, told: str) -> None:
     question = scale.question(units)
     assert told in question if told else not question
 

@@ -339,10 +339,10 @@ def test_the_script_beside_a_run_shows_it_in_colours_that_hold_for_all_states(tm
 
 
 def test_names_of_strangers_do_nothing_in_the_script():
-    from crashkit.writers.paraview_view import Ranges, view_script
+    from crashkit.writers.paraview_view import ValueRanges, view_script
 
     evil = "x'\nimport os; os.abort() #"
-    ranges = Ranges()
+    ranges = ValueRanges()
     ranges.note({evil: np.ones((2, 3))}, {})
     code = view_script(evil, ranges, {evil: evil})
     names = [node.names[0].name for node in ast.walk(ast.parse(code)) if isinstance(node, ast.Import)]

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surrogates.queries.optimum import Local, Problem, sampled, search
+from surrogates.queries.optimum import LocalAnswer, Problem, sampled, search
 
 LOW, HIGH = np.array([0.0, 0.0]), np.array([2.0, 4.0])
 
 
-def found(values, low=LOW, high=HIGH, shift=(0.0,), starts: int = 4) -> list[Local]:  # type: ignore[no-untyped-def]
+def found(values, low=LOW, high=HIGH, shift=(0.0,), starts: int = 4) -> list[LocalAnswer]:  # type: ignore[no-untyped-def]
     problem = Problem(values, low, high)
     box = sampled(problem, 64, 0, lambda done: None)
     return search(problem, box, np.array(shift), starts, [])
