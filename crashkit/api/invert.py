@@ -241,13 +241,13 @@ def _read(measured: str | Path | pd.DataFrame) -> MeasuredPoints:
 
 
 def _length(noise: float | str) -> float:
-    """The standard deviation `noise`, in m; a number alone is in m."""
+    """The standard deviation `noise`, m: a number in m, or a text with its unit."""
     from crashkit.errors import DataError
     from data_schema.units import UnknownUnits, length, number_and_unit
 
     text = noise if isinstance(noise, str) else f"{float(noise)!r} m"
-    if (alone := number_and_unit(text)) and not alone[1]:
-        text = f"{alone[0]!r} m"
+    if (alone := number_and_unit(text)) and not alone[1] and alone[0]:
+        raise DataError(f"noise {text}: in which unit? write for example '{text} mm'")
     try:
         return length(text)
     except UnknownUnits as error:

@@ -36,7 +36,7 @@ def write_d3plot(
         `displacement` (time, node, xyz), m, `reference_position`, `face_nodes`; numbers, parts and `alive` where known.
         A node that is gone stays where it was last.
     folder
-        An earlier family there, written by this, is replaced; anything else is not.
+        New or empty: what a solver wrote looks like what this wrote, so nothing is ever replaced.
     template
         A d3plot of the same model; nodes are matched by their numbers.
     title
@@ -47,11 +47,17 @@ def write_d3plot(
     DataError
         Where the template is of another mesh, or holds what cannot be written again.
     OutputError
-        Where the folder holds something else or cannot be written.
+        Where the folder holds anything already or cannot be written.
     """
+    from crashkit.errors import OutputError
     from crashkit.output import complete_folder
     from crashkit.readers.lasso import d3plot_class
 
+    folder = Path(folder)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise OutputError(
+            f"{folder}: is there and not empty; a d3plot is written into a new folder alone, so remove it or choose another"
+        )
     family = d3plot_class()
     if template is None:
         content = _of_run(family(), run)
@@ -60,7 +66,6 @@ def write_d3plot(
     content.header.title = title.encode("ascii", "replace").decode()[:40].ljust(40)
     if not content.header.version:
         content.header.version, content.header.release_version = _VERSION, "971 "
-    folder = Path(folder)
     with complete_folder(folder, "d3plot") as new:
         try:
             content.write_d3plot(str(new / "d3plot"), single_file=True)

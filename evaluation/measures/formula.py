@@ -182,6 +182,11 @@ class Limit:
         EvaluationError
             Where the units do not belong together.
         """
+        if not self.unit and self.bound and powers(value.unit):
+            raise EvaluationError(
+                f"{self.text}: {self.formula.text} is in {value.unit}; write the unit of the limit, such as "
+                f"'{self.formula.text} {self.sign} {self.bound:g} {value.unit}'"
+            )
         if self.unit and powers(self.unit) != powers(value.unit):
             raise EvaluationError(
                 f"{self.text}: the limit is in {self.unit}, and {self.formula.text} in {value.unit or 'no unit'}"

@@ -60,7 +60,7 @@ def _registered(registration: Registration, parameters: Tensor, time: Tensor) ->
             columns.append(torch.stack(terms).sum(dim=0))
         else:
             value = parameters[:, column.powers.index(1)]
-            columns.append(torch.asinh(value / column.width) if column.width else value)
+            columns.append(_asinh(value / column.width) if column.width else value)
     if registration.symmetry.flagged:
         columns.append(torch.zeros_like(parameters[:, 0]))
     clock = registration.clock
@@ -73,6 +73,11 @@ def _registered(registration: Registration, parameters: Tensor, time: Tensor) ->
         size = parameters[:, clock.speed] / clock.reference[clock.speed] / rate
         time = clock.start + (time - clock.start) * rate
     return torch.stack(columns, dim=1), time, size
+
+
+def _asinh(x: Tensor) -> Tensor:
+    """As torch.asinh, from operations that ONNX Runtime has in double precision."""
+    return x.sign() * (x.abs() + (x.square() + 1).sqrt()).log()
 
 
 def export(surrogate: Surrogate, path: str | Path, level: int | None = None, *, full: bool = False) -> float:

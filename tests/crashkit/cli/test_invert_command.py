@@ -116,3 +116,5 @@ def test_places_elsewhere_and_lengths_without_units(model: Path, moved: np.ndarr
         crashkit.invert(model, in_mm)
     with pytest.raises(CrashkitError, match="no length above zero"):
         crashkit.invert(model, by_node(moved), noise="1kg")
+    with pytest.raises(CrashkitError, match="noise 3: in which unit"):
+        crashkit.invert(model, by_node(moved), noise="3")

@@ -120,12 +120,16 @@ def test_a_template_of_another_model_is_refused(tmp_path: Path) -> None:
 def test_a_folder_of_something_else_stays(tmp_path: Path) -> None:
     (tmp_path / "d3plot").mkdir()
     (tmp_path / "d3plot" / "thesis.txt").write_text("years of work")
-    with pytest.raises(CrashkitError, match="holds no d3plot"):
+    with pytest.raises(CrashkitError, match="is there and not empty"):
         write_d3plot(struck(), tmp_path / "d3plot")
     assert (tmp_path / "d3plot" / "thesis.txt").exists()
     (tmp_path / "d3plot" / "thesis.txt").unlink()
     write_d3plot(struck(), tmp_path / "d3plot")
-    write_d3plot(struck(), tmp_path / "d3plot")
+    before = {p.name: p.read_bytes() for p in (tmp_path / "d3plot").iterdir()}
+    for template in (None, tmp_path / "d3plot"):  # what a solver wrote looks the same
+        with pytest.raises(CrashkitError, match="not empty; a d3plot is written into a new folder"):
+            write_d3plot(struck(), tmp_path / "d3plot", template)
+    assert {p.name: p.read_bytes() for p in (tmp_path / "d3plot").iterdir()} == before
 
 
 def test_a_node_that_is_gone_stays_where_it_was(tmp_path: Path) -> None:

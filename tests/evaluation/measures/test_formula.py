@@ -132,6 +132,8 @@ def test_limits_have_units() -> None:
     assert list(limit.kept(limit.formula.number(Toy(), formulas))) == [True, False]
     with pytest.raises(EvaluationError, match="the limit is in N"):
         read_limit("intrusion < 5 kN", formulas).kept(limit.formula.number(Toy()))
+    with pytest.raises(EvaluationError, match=r"intrusion < 200: .* is in m; write the unit of the limit"):
+        read_limit("intrusion < 200", formulas).kept(limit.formula.number(Toy()))
     for bad in ("intrusion", "intrusion < ", "1 < intrusion < 2", "intrusion == 3", "intrusion < 3 parsec2x"):
         with pytest.raises(EvaluationError, match=r"limit|unit"):
             read_limit(bad, formulas)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 import torch
 
 from surrogates.errors import SurrogateError
+from surrogates.physics.derived import Column
 from surrogates.settings import settings
 from surrogates.storage.export import export
 from surrogates.surrogate import Surrogate
@@ -40,6 +42,17 @@ def test_onnxruntime_predicts_as_the_surrogate_does(
     ask = surrogate.predict_full if full else surrogate.predict
     expected = np.stack([ask(p, [t], level)[0] for p, t in zip(mu, time, strict=True)])
     np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_warped_and_logarithmic_inputs_are_known_to_onnxruntime(surrogate: Surrogate, tmp_path: Path) -> None:
+    """The numbers of such a model mean nothing, but they are the same."""
+    registration = surrogate.registration
+    columns = (Column((1, 0, 0), logarithm=True), Column((0, 1, 0), width=4.0), Column((0, 0, 1), logarithm=True))
+    surrogate.registration = replace(registration, inputs=replace(registration.inputs, columns=columns))
+    try:
+        assert export(surrogate, tmp_path / "model.onnx", 2) <= 1e-4
+    finally:
+        surrogate.registration = registration
 
 
 def test_a_torch_program_predicts_as_the_surrogate_does(surrogate: Surrogate, tmp_path: Path) -> None:
