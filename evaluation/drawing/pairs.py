@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.drawing.style import FAINT, INK, Sheet, look, readable, span
+from evaluation.drawing.style import FAINT, INK, Sheet, label_outer, look, readable, span
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -77,14 +77,7 @@ def pairs_figure(
                     ax.hist2d(x[first:], y[first:], bins=_BINS, range=box, cmap="Blues", cmin=1)
                     ax.plot(x[3:first], y[3:first], "x", color=INK, markersize=5)
                     ax.plot(x[2], y[2], "+", color=_RED, markersize=9, markeredgewidth=1.6)
-                if i == n - 1:
-                    ax.set_xlabel(labels[j])
-                else:
-                    ax.tick_params(labelbottom=False)
-                if j == 0 and i > 0:
-                    ax.set_ylabel(labels[i])
-                elif j > 0:
-                    ax.tick_params(labelleft=False)
+                label_outer(ax, i, j, labels)
     return figure
 
 

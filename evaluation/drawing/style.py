@@ -172,6 +172,18 @@ def short(value: float) -> str:
     return f"{value:#.2g}".rstrip(".") if abs(value) < 99.5 else f"{value:.0f}"
 
 
+def label_outer(ax: Any, row: int, column: int, labels: Sequence[str]) -> None:
+    """Labels and ticks of one panel of a square of pairs: below the last row and left of the first column alone."""
+    if row == len(labels) - 1:
+        ax.set_xlabel(labels[column])
+    else:
+        ax.tick_params(labelbottom=False)
+    if column == 0 and row > 0:
+        ax.set_ylabel(labels[row])
+    elif column > 0:
+        ax.tick_params(labelleft=False)
+
+
 def few_log_ticks(axis: Any) -> None:
     """Plain numbers at 1, 2 and 5 of each decade of a logarithmic axis, at decades alone where there are many."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter

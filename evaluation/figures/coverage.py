@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.drawing.style import Sheet, look, readable, span
+from evaluation.drawing.style import Sheet, label_outer, look, readable, span
 from evaluation.figures.kind import Columns, Kind
 
 if TYPE_CHECKING:
@@ -68,14 +68,7 @@ class Coverage:
                             color=colour, markersize=3.2, markeredgewidth=0, alpha=0.8,
                         )  # fmt: skip
                     ax.margins(0.06)
-                if i == n - 1:
-                    ax.set_xlabel(labels[j])
-                else:
-                    ax.tick_params(labelbottom=False)
-                if j == 0 and i > 0:
-                    ax.set_ylabel(labels[i])
-                elif j > 0:
-                    ax.tick_params(labelleft=False)
+                label_outer(ax, i, j, labels)
         if self.test.any():
             from matplotlib.lines import Line2D
 
