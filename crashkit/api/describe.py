@@ -279,7 +279,7 @@ def what_was_chosen(record: Record) -> list[str]:
 
 
 def what_is_said_of_elements(surrogate: Surrogate) -> list[str]:
-    """How well removal, and results on elements, are told of runs that were left out: a line each."""
+    """Errors of the predicted removal and of results on elements, on left-out runs: one line each."""
     out = []
     removal = surrogate.removal
     if removal is not None and removal.scores:

@@ -38,7 +38,7 @@ class NumberJudge:
         Raises
         ------
         EvaluationError
-            For formulas that are none, or that ask for what there is not.
+            For a text that is no formula, and for fields, parts or histories that the data do not have.
         """
         from surrogates.training.train import curve_targets
 

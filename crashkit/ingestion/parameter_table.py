@@ -190,7 +190,7 @@ class Numbers:
 
 
 def read_numbers(path: Path, keys: Sequence[str], aside: Sequence[str] = ()) -> Numbers:
-    """A table of which every column holds numbers, such as measured points; one of `keys` stands in its header.
+    """A table with numbers in every column, such as measured points; its header has at least one of `keys`.
 
     Columns called as in `aside` are left out.
 

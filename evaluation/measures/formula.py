@@ -75,7 +75,7 @@ class FormulaRuns(Protocol):
 class Value:
     """An intermediate result: `array` (run, *axes), axes a subset of ("time", "node"), the `time` of its states, its unit.
 
-    A number that stands in the formula itself has one run.
+    A number written in the formula is an array of one run.
     """
 
     array: NDArray[np.floating]
@@ -280,7 +280,7 @@ def part_nodes(parts: Mapping[str, NDArray[np.int64]], wanted: str) -> NDArray[n
 
 
 def powers(unit: str) -> dict[str, int]:
-    """A unit as exponents of kg, m, s and whatever else stands in it: "N m" -> {"kg": 1, "m": 2, "s": -2}."""
+    """Exponents of the base units in a unit: "N m" -> {"kg": 1, "m": 2, "s": -2}; unknown units are bases, too."""
     out: dict[str, int] = {}
     for word, power in re.findall(r"([^\W\d]+|°)(-?\d+)?", unit):
         for base, times in _NAMED.get(word, {word: 1}).items():
