@@ -2,46 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from pathlib import Path
+from study_driver.jobs import Kind, Plan
 
 RUNS, TRAIN = 120, 96  # as in the paper: runs 0 to 95 train, the others test
 NODES = "1165,292,73"  # the paper's node counts
 SIZES = (12, 24, 48)  # fewer training runs, for the learning curves
-
-
-@dataclass(frozen=True)
-class Kind:
-    """One model of the table: options of `crashkit train` beside data, split and seed."""
-
-    name: str
-    model: str
-    settings: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Job:
-    """One training: a kind on the first `runs` runs of the campaign, which leaves the others alone."""
-
-    kind: Kind
-    seed: int = 0
-    runs: int = TRAIN
-
-    @property
-    def folder(self) -> Path:
-        """Where the model is kept, within the study's folder."""
-        few = "" if self.runs == TRAIN else f"-{self.runs}-runs"
-        return Path("models") / f"{self.kind.name}{few}-seed-{self.seed}"
-
-    def command(self, data: Path, home: Path) -> list[str]:
-        """The arguments of `crashkit`."""
-        own = [part for setting in self.kind.settings for part in ("--set", setting)]
-        return [
-            "train", str(data), "-o", str(home / self.folder), "--model", self.kind.model,
-            "--test", f"{self.runs}:{RUNS}", "--seed", str(self.seed), "--device", "cpu", *own,
-        ]  # fmt: skip
-
 
 # The fast preset was chosen on the small campaign of the demo. Here there are four times as many states for each epoch,
 # so fewer epochs do; and a network that sees 84 runs a hundred times overfits unless its weights are held
@@ -63,7 +28,6 @@ GAENN = Kind("gaenn", "gaenn", ("level.epochs=6", *COMMON[1:]))
 MH_ALL = Kind("mh-all-runs", "mh", (*MH.settings, "validation.measure=paper", "level.regression=mean"))
 
 TABLE = (MH, PODNN, POD_GPR, POD_RBF, AENN, GAENN)
-NETWORKS = ("mh", "podnn", "aenn", "gaenn")  # trained by epochs
 CURVES = (MH, PODNN, POD_GPR)
 
 # What else was tried, on the coarsest level and judged on validation runs alone.
@@ -82,32 +46,4 @@ ALTERNATIVES = (
     Kind("paper-preset", "mh", ("preset=paper", "validation.measure=runs", *COARSEST)),
 )
 
-
-def _with_epochs(kind: Kind, epochs: Callable[[int], int]) -> tuple[str, ...]:
-    """The settings of `kind` with other numbers of epochs; shares of epochs stay."""
-
-    def changed(setting: str) -> str:
-        path, value = setting.split("=", 1)
-        return f"{path}={epochs(int(value))}" if path.endswith(".epochs") and value.isdigit() else setting
-
-    return tuple(map(changed, kind.settings))
-
-
-def quick(kind: Kind) -> Kind:
-    """A short version for trials: an eighth of the epochs."""
-    return replace(kind, settings=_with_epochs(kind, lambda n: max(2, n // 8)))
-
-
-def alone(kind: Kind) -> Kind:
-    """Three epochs of every level, to be timed while nothing else runs."""
-    return Kind(f"{kind.name}-alone", kind.model, (*_with_epochs(kind, lambda n: 3), "transfer.epochs=1"))
-
-
-def jobs(seeds: int, short: bool) -> list[Job]:
-    """All trainings, in the order in which they are worth having."""
-    shape = quick if short else (lambda kind: kind)
-    table = [Job(shape(kind), seed) for kind in TABLE for seed in range(seeds)]
-    few = [Job(shape(kind), 0, runs) for kind in CURVES for runs in SIZES]
-    other = [] if short else [Job(MH_ALL, seed) for seed in range(seeds)] + [Job(kind) for kind in ALTERNATIVES]
-    slow = [job for job in table if job.kind.model in ("aenn", "gaenn")]
-    return [*(job for job in table if job not in slow), *few, *slow, *other]
+PLAN = Plan("kart", RUNS, TRAIN, NODES, TABLE, curves=CURVES, sizes=SIZES, beside=(MH_ALL,), alternatives=ALTERNATIVES)
