@@ -20,6 +20,7 @@ from study_driver.tables import (
     not_trained,
     on_coarse_meshes,
     performance,
+    regressions,
     rows,
     write_tables,
 )
@@ -82,6 +83,7 @@ def tables(study: Study) -> list[Path]:
         ),
         "goals": goals(known),
         "coarse": on_coarse_meshes(study, found),
+        "regressions": regressions(study),
         "not_trained": not_trained(study),
     }
     if whole and not study.short:

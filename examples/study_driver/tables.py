@@ -265,6 +265,16 @@ def worth(study: Study, kind: Kind) -> Columns:
     )
 
 
+def regressions(study: Study) -> Columns:
+    """What each level of a cascade predicts its latent numbers with, as folds chose, of the first seed of each kind."""
+    lines = []
+    for kind in dict.fromkeys(job.kind for job in study.compared() if job.kind.model == "mh" and job.seed == 0):
+        surrogate = crashkit.load_model(study.home / Job(kind).folder).surrogate
+        for level in surrogate.level_names:
+            lines.append((kind.label(level), surrogate.record.choice.get(level, "a network")))
+    return columns(("model", "from_parameters_to_latent_numbers"), lines)
+
+
 def not_trained(study: Study) -> Columns:
     """What the plan names and nobody has trained: by model, training runs and seeds."""
     seeds: dict[tuple[str, int], list[int]] = {}

@@ -18,7 +18,7 @@ from evaluation.figures import Sheet
 HOME = Path(__file__).parents[2] / "examples"
 DRIVER = ("study_driver", "study_driver.jobs", "study_driver.driver", "study_driver.tables")
 OWN = ("plan", "study", "results", "rigid")
-STUDIES = ("kart_study",)
+STUDIES = ("kart_study", "bumper_study")
 
 
 def modules_of(name: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
@@ -248,7 +248,15 @@ def test_a_quick_study_leaves_report_tables_and_curves_and_does_nothing_twice(ka
     given = [str(demo_data()), "-o", str(tmp_path / "s"), "--quick"]
     driver.main(small, results.tables, "", given)
     folder = tmp_path / "s" / "quick" / "results"
-    assert {p.stem for p in folder.glob("*.md")} == {"table", "coarse", "paper", "averaged", "goals", "not_trained"}
+    assert {p.stem for p in folder.glob("*.md")} == {
+        "table",
+        "coarse",
+        "paper",
+        "averaged",
+        "goals",
+        "regressions",
+        "not_trained",
+    }
     curves = (folder / "learning_curves.csv").read_text().splitlines()
     assert [line.rsplit(",", 1)[0] for line in curves[1:]] == ["POD-GPR,6", "POD-GPR,27"]
     assert (tmp_path / "s" / "quick" / "report" / "report.html").stat().st_size > 100_000
