@@ -287,6 +287,8 @@ class Settings(_Frozen):
         `fast`, or `paper` for exactly what the paper does.
     seed
         Of all random numbers.
+    seeds
+        Trainings, with `seed` and the next ones, of which the model is the mean.
     levels
         Mesh levels of the cascade, coarsest first; empty: all levels of the hierarchy.
     level
@@ -314,6 +316,7 @@ class Settings(_Frozen):
     model: ModelName = "mh"
     preset: Preset = "fast"
     seed: Annotated[int, Field(ge=0)] = 0
+    seeds: Positive = 1
     levels: tuple[Annotated[int, Field(ge=0)], ...] = ()
     level: LevelSettings = LevelSettings()
     at: Mapping[int, Mapping[str, Any]] = {}
@@ -371,6 +374,11 @@ class Settings(_Frozen):
             raise ValueError(f"latent sizes {sorted(latents)} differ; transfer.encoder=add needs one size")
         if self.unified and self.refinement.adaptive:
             raise ValueError("unified trains all levels together, refinement.adaptive one after the other; choose one")
+        if self.seeds > 1 and self.refinement.adaptive:
+            raise ValueError(
+                "refinement.adaptive makes another mesh in every training, and trainings (seeds) are averaged on one; "
+                "choose one of both"
+            )
         if self.unified and self.transfer.encoder == "concat":
             raise ValueError("unified has one latent vector, so transfer.encoder=concat means nothing")
         return self

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -85,6 +86,20 @@ class Surrogate:
         self.fields: dict[str, ElementField] = {}
         self.curves: dict[str, Curve] = {}
         self._upward: dict[int, sparse.csr_matrix] = {}
+
+    def untrained(self) -> Surrogate:
+        """Another one for the same data, behind the same registration, with nothing trained yet."""
+        from surrogates.models.cascade import Cascade
+
+        if isinstance(self.core, PodRegression):
+            raise SurrogateError("what is trained for each seed is a network")
+        core, record = Cascade(self.core.inputs), replace(self.record, fits={}, errors={}, choice={})
+        return Surrogate(self.settings, record, self.graphs, core, self.points, self.faces, self.registration)
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """The seeds of the trainings it is the mean of, or of its only one."""
+        return getattr(self.core, "seeds", (self.record.seed,))
 
     @property
     def level_names(self) -> dict[str, int]:
@@ -294,9 +309,26 @@ class Surrogate:
     def beliefs(self, parameters: NDArray[np.float64]) -> Beliefs:
         """What the model says of runs (run, parameter) before they are computed: their size, and its own deviation."""
         core = self.core
-        said = core.deviation(self.registration.read(parameters)) if isinstance(core, PodRegression) else None
+        said = self._apart(parameters)
+        if isinstance(core, PodRegression):
+            said = core.deviation(self.registration.read(parameters))
         deviation = np.ones(len(parameters)) if said is None else said
         return Beliefs(self.registration.clock.size(parameters), deviation, *self.places(parameters))
+
+    def _apart(self, parameters: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """(run,) m: how far the trainings behind it lie apart, for a run of size 1; None for a single one."""
+        from surrogates.models.average import Average, some_states, spread_of
+
+        core = self.core
+        if not isinstance(core, Average):
+            return None
+        number, time = max(core.numbers), self.record.time[some_states(len(self.record.time))]
+        said = [
+            self.registration.undo(lambda x, t, n=one: self.by_network(x, t, number, network=n), parameters, time)  # type: ignore[misc]
+            for one in core.networks
+        ]
+        spread = np.array([spread_of([one[run] for one in said]) for run in range(len(parameters))])
+        return core.deviation(spread / self.registration.clock.size(parameters))
 
     def places(self, parameters: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
         """Where runs (run, parameter) lie in the trained range, in [-1, 1], and where their mirror images do."""
@@ -404,11 +436,12 @@ class Surrogate:
         time: NDArray[np.float64],
         number: int,
         end: Callable[[Tensor], Tensor] = lambda states: states.transpose(0, 1).contiguous(),
+        network: Network | None = None,
     ) -> NDArray[np.float32]:
-        """(batch, state, node, 3); `end` makes (b, node, 3) of states (node, b, 3)."""
+        """(batch, state, node, 3); `end` makes (b, node, 3) of states (node, b, 3); `network`: instead of its own."""
         import torch
 
-        core, some = self.core, _chunk(self.graphs.n_nodes(number))
+        core, some = network or self.core, _chunk(self.graphs.n_nodes(number))
         at = torch.from_numpy(np.repeat(parameters, len(time), axis=0))
         when = torch.from_numpy(np.tile(time, len(parameters)))
         with torch.no_grad():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -199,6 +200,7 @@ def describe_model(surrogate: Surrogate, path: Path) -> dict[str, Any]:
         "preset": surrogate.settings.preset,
         "created": record.created,
         "seed": record.seed,
+        "seeds": list(surrogate.seeds),
         "crashkit_version": record.versions.get("crashkit"),
         "checksum": record.checksum,
         **{key: str(value) for key, value in record.attributes.items()},
@@ -238,6 +240,7 @@ def describe_training(surrogate: Surrogate, output: Path) -> dict[str, Any]:
         "output": output, "levels": trained_levels(surrogate), "choice": record.choice,
         "validation_errors_m": record.errors, "training_runs": record.fitted_runs,
         "validation_runs": record.validation_runs, "held_out_runs": record.held_out_runs,
+        "seeds": surrogate.seeds, "errors_of_each_seed_m": record.members,
         "physics": record.physics, "notes": record.notes,
         "removal": None if surrogate.removal is None else {k: vars(v) for k, v in surrogate.removal.scores.items()},
         "fields": {name: known.errors for name, known in surrogate.fields.items()},
@@ -261,6 +264,28 @@ def trained_levels(surrogate: Surrogate) -> list[dict[str, Any]]:
         for name, number in surrogate.level_names.items()
         if (fit := surrogate.training(number)) is not None
     ]
+
+
+def seeds_told(seeds: Sequence[int]) -> str:
+    """The seeds of a model in words: seed 0, or the mean of 5 trainings with seeds 0 to 4."""
+    return (
+        f"seed {seeds[0]}"
+        if len(seeds) == 1
+        else f"seeds {seeds[0]} to {seeds[-1]}, the mean of {len(seeds)} trainings"
+    )
+
+
+def what_the_mean_is_worth(surrogate: Surrogate) -> list[str]:
+    """For each level the error of the mean of several trainings, and of each alone, cm: a line each."""
+    out, record = [], surrogate.record
+    for name in surrogate.level_names:
+        alone = [100 * errors[name] for errors in record.members.values() if name in errors]
+        if alone:
+            out.append(
+                f"{name}: the mean of {len(alone)} trainings has {100 * record.errors[name]:.2f} cm, each alone "
+                f"{min(alone):.2f} to {max(alone):.2f} cm"
+            )
+    return out
 
 
 def what_was_chosen(record: Record) -> list[str]:

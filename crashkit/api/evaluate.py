@@ -500,6 +500,7 @@ def as_model(surrogate: Surrogate, folder: Path, reference: Reference) -> Compar
         held_out_runs=record.held_out_runs,
         checksum=record.checksum,
         seed=record.seed,
+        averaged=len(surrogate.seeds),
         configuration=configuration,
         known={name: told for name, told in record.physics.items() if isinstance(told, str)},
         worth=record.physics.get("errors") or {},

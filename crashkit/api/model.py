@@ -357,6 +357,7 @@ class Model:
         return out
 
     def _facts(self) -> tuple[str, dict[str, object], tuple[str, ...], list[tuple[object, ...]]]:
+        from crashkit.api.describe import seeds_told
         from crashkit.display import listed
 
         record, settings = self.record, self.settings
@@ -375,7 +376,7 @@ class Model:
             )
             for name, level in self.levels.items()
         ]  # fmt: skip
-        title = f"crashkit.Model {self.name}: {settings.model}, preset {settings.preset}, seed {record.seed}"
+        title = f"crashkit.Model {self.name}: {settings.model}, preset {settings.preset}, {seeds_told(self.surrogate.seeds)}"
         return title, facts, ("level", "nodes", "latent", "parameters", "validation error (cm)"), rows
 
     def __repr__(self) -> str:

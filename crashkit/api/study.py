@@ -55,6 +55,7 @@ class ModelStep(_Strict):
     set: dict[str, Any] = {}
     epochs: Positive | None = None
     seed: Annotated[int, Field(ge=0)] | None = None
+    seeds: Positive | None = None
     device: str | None = None
 
 

@@ -32,6 +32,7 @@ def train(
     settings: Mapping[str, Any] | Sequence[str] = (),
     config: str | Path | None = None,
     seed: int | None = None,
+    seeds: int | None = None,
     epochs: int | None = None,
     test: WhichRuns | None = None,
     targets: Sequence[str] = (),
@@ -66,6 +67,9 @@ def train(
         YAML file with the same fields.
     seed, epochs
         Random seed, and epochs of every level; over all of the above.
+    seeds
+        Trainings, with this seed and the next ones, one after the other; the model is their mean, and its band follows how
+        far they lie apart. It takes as many times as long to train, and to predict, as one.
     test
         Runs held out for testing: "27:36", names, a number or a fraction (drawn at random, seeded).
     targets
@@ -121,6 +125,7 @@ def train(
     from surrogates.training.train import train_surrogate
 
     given: dict[str, Any] = {} if seed is None else {"seed": seed}
+    given |= {} if seeds is None else {"seeds": seeds}
     given |= {} if epochs is None else {"level.epochs": epochs, "transfer.epochs": 1}
     if targets:
         given["targets"] = list(dict.fromkeys(["displacement", *targets]))

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from crashkit.api.describe import seeds_told
 from crashkit.cli._console import console, print_json, table, what_next
 from crashkit.cli._progress import Progress
 from crashkit.display import listed
@@ -110,7 +111,7 @@ def _print_model(found: dict[str, Any]) -> None:
     out = console()
     out.print(
         f"{found['path']}: {found['kind']} model ({found['preset']}), {found['bytes_on_disk'] / 1e6:.1f} MB, trained "
-        f"{found['created']} with seed {found['seed']}",
+        f"{found['created']} with {seeds_told(found['seeds'])}",
         markup=False,
     )
     out.print(f"  dataset     {found.get('dataset', 'unknown')}, checksum {found['checksum'][:12]}", markup=False)

@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from crashkit.api.describe import describe_training, middle, trained_levels, what_is_said_of_elements, what_was_chosen
+from crashkit.api.describe import (
+    describe_training,
+    middle,
+    trained_levels,
+    what_is_said_of_elements,
+    what_the_mean_is_worth,
+    what_was_chosen,
+)
 from crashkit.api.train import interrupted, left_behind, train
 from crashkit.cli._console import fixed, names, print_json, say, table, what_next
 from crashkit.cli._progress import Progress
@@ -50,6 +57,14 @@ def command(
         int | None, typer.Option(help="Epochs of every level.", min=1, show_default="from the settings")
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Random seed.", min=0, show_default="from the settings")] = None,
+    seeds: Annotated[
+        int | None,
+        typer.Option(
+            help="Trainings whose mean is the model, such as 5: with this seed and the next ones; each takes as long as one.",
+            min=1,
+            show_default="1",
+        ),
+    ] = None,
     device: Annotated[str, typer.Option(help="cpu, cuda, mps or auto.")] = "auto",
     resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted training.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the model that is there.")] = False,
@@ -64,9 +79,15 @@ def command(
     if not json:
         for left in left_behind(output, resume=resume):
             say(f"note: {left}")
+        if seeds is not None and seeds > 1:
+            say(
+                f"{seeds} trainings, one after the other: {seeds} times the time of one and {seeds} times its space on disk, the "
+                "memory of one and the weights of those that are done; "
+                "Ctrl-C keeps those that are done, --resume --overwrite goes on with the next"
+            )
     with Progress(f"reading {dataset}", quiet=json) as shown:
         surrogate = train(
-            dataset, output, model or None, preset=preset or None, settings=given, config=config, seed=seed,
+            dataset, output, model or None, preset=preset or None, settings=given, config=config, seed=seed, seeds=seeds,
             epochs=epochs, test=test or None, device=device, resume=resume, overwrite=overwrite,
             targets=() if targets == "displacement" else names(targets),
             tensorboard=tensorboard, on_epoch=epoch_lines(shown, verbose),
@@ -127,5 +148,5 @@ def show(surrogate: Surrogate, output: Path) -> None:
             ("what", "unit", "runs", "mean error", "typical value"),
             ((r["name"], r["unit"], r["runs"], plain(r["error"]), plain(r["size"])) for r in beside),
         )
-    for line in [*what_was_chosen(record), *what_is_said_of_elements(surrogate)]:
+    for line in [*what_the_mean_is_worth(surrogate), *what_was_chosen(record), *what_is_said_of_elements(surrogate)]:
         say(line)

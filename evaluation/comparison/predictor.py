@@ -84,6 +84,8 @@ class ComparedModel:
         SHA-256 of the dataset it was trained on.
     seed
         Of its training; None where nothing is random.
+    averaged
+        Trainings, with this seed and the next ones, that it is the mean of.
     configuration
         Its settings, for the methods section; without the seed, models of one kind agree in it.
     known
@@ -102,6 +104,7 @@ class ComparedModel:
     held_out_runs: tuple[str, ...] = ()
     checksum: str = ""
     seed: int | None = None
+    averaged: int = 1
     configuration: Mapping[str, object] = field(default_factory=dict)
     known: Mapping[str, str] = field(default_factory=dict)
     worth: Mapping[str, float] = field(default_factory=dict)

@@ -58,7 +58,7 @@ function makeModel(spec, arrays, mesh) {
     if (known.spread === 'constant') return 1;
     const size = registration.clock(p, 0)[1];
     if (known.spread === 'size') return size;
-    const expected = size * Math.sqrt(core.deviation ? core.deviation(registration.inputs(p)) : 1);
+    const expected = size * Math.sqrt(core.deviation ? core.deviation(registration.inputs(p), (t) => registration.clock(p, t)[0]) : 1);
     return known.spread === 'local' ? expected * localErrors(known.local, place(p)) : expected;
   }
 
@@ -206,7 +206,7 @@ function interpolate(grid, values, time) {
   return values[k] * (1 - s) + values[Math.min(k + 1, values.length - 1)] * s;
 }
 
-// Networks as a list of steps on named vectors; each level is one list that ends in `out`, divided by its scale.
+// Networks as a list of steps on named vectors; each level is one list that ends in `out`, m.
 function makeCascade(spec, arrays) {
   const steps = {
     linear(s, at) { return affine(arrays[s.weight], s.bias && arrays[s.bias], at[s.of]); },
@@ -246,12 +246,23 @@ function makeCascade(spec, arrays) {
     },
     kernel(s, at) { return kernelStep(s, arrays, at[s.of]); },
   };
-  function state(inputs, time, level) {
-    const own = spec.levels.find((l) => l.number === level), at = {inputs: scaledInputs(spec.scaling, inputs, time)};
-    for (const s of own.steps) at[s.out] = steps[s.step](s, at);
-    return at.out.map((v) => v * own.scale);
+  function done(inputs, time, level) {
+    const at = {inputs: scaledInputs(spec.scaling, inputs, time)};
+    for (const s of level.steps) at[s.out] = steps[s.step](s, at);
+    return at;
   }
-  return {prepare: (inputs) => inputs, state};
+  function state(inputs, time, level) { return done(inputs, time, spec.levels.find((l) => l.number === level)).out; }
+  // How far the trainings behind a mean lie apart, m, for a run of size 1; see surrogates/models/average.py.
+  function apart(inputs, clock) {
+    const {level: number, floor, time} = spec.apart, level = spec.levels.find((l) => l.number === number);
+    let sum = 0;
+    for (const t of time) {
+      const at = done(inputs, clock(t), level);
+      for (const name of level.outs) at[name].forEach((v, i) => { sum += (v - at.out[i]) ** 2; });
+    }
+    return Math.hypot(Math.sqrt(sum / (time.length * level.outs.length * level.nodes)), floor);
+  }
+  return {prepare: (inputs) => inputs, state, deviation: spec.apart && apart};
 }
 
 const ACTIVATIONS = {

@@ -272,4 +272,7 @@ def _details(evaluation: Evaluation) -> list[tuple[str, str]]:
 
 
 def _with_seed(model: ComparedModel) -> str:
-    return model.name if model.seed is None else f"{model.name} (seed {model.seed})"
+    if model.seed is None:
+        return model.name
+    several = f"mean of {model.averaged} trainings, seeds from " if model.averaged > 1 else "seed "
+    return f"{model.name} ({several}{model.seed})"

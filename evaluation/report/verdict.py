@@ -298,11 +298,12 @@ def _warnings(evaluation: Evaluation) -> list[Statement]:
                 f"There are {count} test runs. Differences smaller than the spread between runs are not reliable.",
             )
         )
-    once = [e.label for e in evaluation.leaders if len(e.keys) == 1]
+    averaged = [e.label for e in evaluation.leaders if evaluation.model(e).averaged > 1]
+    once = [e.label for e in evaluation.leaders if len(e.keys) == 1 and e.label not in averaged]
     if len(once) < len(evaluation.leaders) and once:
         text = f"Trained once, so without a spread: {_listed(once)}. How much their results depend on the seed is not known."
         out.append(Statement("warning", "Models with one seed", text))
-    if len(once) == len(evaluation.leaders):
+    if once and len(once) == len(evaluation.leaders):
         out.append(
             Statement(
                 "warning",

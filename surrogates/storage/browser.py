@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from surrogates.errors import SurrogateError
 from surrogates.local_errors import HARD, REACH, LocalErrors
+from surrogates.models.average import Average, some_states
 from surrogates.models.cascade import Cascade
 from surrogates.models.pod_regression import PodRegression
 from surrogates.regression.gaussian import Gaussian
@@ -59,7 +60,13 @@ def browsable(surrogate: Surrogate, name: str, prefix: str, share: float = 0.9) 
     if isinstance(core, PodRegression):
         about |= _process(core, arrays, quantised, prefix)
     elif isinstance(core, Cascade):
-        about |= cascade_steps(core, about["levels"], arrays, prefix)
+        about |= cascade_steps([core], about["levels"], arrays, prefix)
+    elif isinstance(core, Average) and all(isinstance(member, Cascade) for member in core.networks):
+        about |= cascade_steps(core.networks, about["levels"], arrays, prefix)  # type: ignore[arg-type]
+        places = some_states(len(surrogate.record.time))
+        about["apart"] = {
+            "level": max(core.numbers), "floor": core.floor, "time": surrogate.record.time[places].tolist(),
+        }  # fmt: skip
     else:
         raise SurrogateError(
             f"{name}: unified levels have no form for a browser; use mh, podnn, aenn, gaenn or pod-gpr"

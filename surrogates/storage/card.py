@@ -20,7 +20,7 @@ def card(surrogate: Surrogate) -> str:
     lines = [
         f"# {names}",
         "",
-        f"Surrogate of kind `{settings.model}` (preset `{settings.preset}`), fitted {record.created} with seed {record.seed}.",
+        f"Surrogate of kind `{settings.model}` (preset `{settings.preset}`), fitted {record.created} with {_seeds(surrogate)}.",
         "It predicts nodal displacements in metres for given parameters and times.",
         "",
         "## Inputs",
@@ -45,6 +45,7 @@ def card(surrogate: Surrogate) -> str:
             [_level_row(surrogate, name, number) for name, number in surrogate.level_names.items()],
         ),
         "",
+        *_members(surrogate),
         *(("## Errors in cross-validation", "") if by_folds else ("## Errors on validation runs", "")),
     ]
     if record.errors and by_folds:
@@ -90,6 +91,32 @@ def card(surrogate: Surrogate) -> str:
         "",
     ]
     return "\n".join(lines)
+
+
+def _seeds(surrogate: Surrogate) -> str:
+    seeds = surrogate.seeds
+    return f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {', '.join(map(str, seeds))}"
+
+
+def _members(surrogate: Surrogate) -> list[str]:
+    """What the mean of several trainings is worth beside each of them."""
+    record = surrogate.record
+    if not record.members:
+        return []
+    levels = list(surrogate.level_names)
+    rows = [
+        (f"seed {seed}", *(f"{100 * errors[name]:.3f}" for name in levels)) for seed, errors in record.members.items()
+    ]
+    mean = ("mean of all", *(f"{100 * record.errors[name]:.3f}" for name in levels))
+    return [
+        "## Trainings",
+        "",
+        f"Every prediction is the mean of those of {len(surrogate.seeds)} trainings that differ by their seed alone; epochs above",
+        "are the first one's, seconds those of all. Errors (cm) on the same runs as below, of each alone and of the mean:",
+        "",
+        *_table(("training", *levels), [*rows, mean]),
+        "",
+    ]
 
 
 def _elements(surrogate: Surrogate) -> list[str]:

@@ -1,7 +1,8 @@
 """A surrogate as a folder: weights, settings, scaling, ranges, the hierarchy it needs, its history and its card.
 
     model.json             what it is; SHA-256 of every other file, and of itself
-    level_3.safetensors .. weights of each level (pod.safetensors for POD regressions)
+    level_3.safetensors .. weights of each level (pod.safetensors for POD regressions); where the model is the mean of
+                           several trainings, seed_0.level_3.safetensors .. of each
     graphs.safetensors     the levels' graphs and maps, and the full mesh, so that it lifts and draws without the data
     elements.safetensors   what is said of elements: their removal, plastic strain and the like; where there is any
     bands.safetensors      how far predictions may be wrong, from the validation runs
@@ -17,7 +18,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -55,6 +56,7 @@ from surrogates.surrogate import Surrogate
 from surrogates.uncertainty import Band, Spread
 
 if TYPE_CHECKING:
+    from surrogates.data.scaling import InputScaling
     from surrogates.models.base import Network
 
 FORMAT = 2
@@ -177,15 +179,10 @@ def _write(surrogate: Surrogate, folder: Path) -> None:
         "inputs": _plain(ranges_as_dict(record.ranges if isinstance(core, PodRegression) else core.inputs.ranges)),
         "registration": _plain(surrogate.registration.as_dict()),
         "levels": [
-            {
-                "number": k,
-                "name": name,
-                "nodes": surrogate.graphs.n_nodes(k),
-                "scale": _scale(core, k),
-                "at_rest": _at_rest(core, k),
-            }
+            {"number": k, "name": name, "nodes": surrogate.graphs.n_nodes(k), **_of_level(core, k)}
             for name, k in surrogate.level_names.items()
         ],
+        **_about_members(core),
         "curves": _plain({name: curve.told() for name, curve in surrogate.curves.items()}),
         "parts": [] if surrogate.labels is None else list(surrogate.labels.part_name),
         "elements": _plain(_about_elements(surrogate)),
@@ -222,41 +219,66 @@ def _core(
 ) -> Network | PodRegression:
     if settings.model in ("pod-gpr", "pod-rbf"):
         return PodRegression.load(load_file(folder / "pod.safetensors"), settings.model, record.choice["inputs"])
+    from surrogates.data.scaling import InputScaling
+    from surrogates.models.average import Average
+
+    ranges = ranges_from_dict(about["inputs"])
+    scaling = InputScaling(ranges, products=settings.inputs.products, angles=settings.inputs.angles)
+    told = about.get("members")
+    if told is None:
+        return _network(folder, "", about["levels"], settings, graphs, scaling)
+    members = [_network(folder, f"seed_{m['seed']}.", m["levels"], settings, graphs, scaling) for m in told]
+    return Average(members, [int(m["seed"]) for m in told], float(about["floor"]))
+
+
+def _network(
+    folder: Path, prefix: str, entries: Sequence[Mapping[str, Any]], settings: Settings, graphs: Graphs, scaling: InputScaling
+) -> Network:  # fmt: skip
+    """A network whose levels are `entries`, with the weights in files that begin with `prefix`."""
     from safetensors.torch import load_file as load_tensors
 
-    from surrogates.data.scaling import InputScaling
     from surrogates.models.base import take_over
     from surrogates.models.cascade import Cascade, build_level
     from surrogates.models.unified import Unified
 
-    ranges = ranges_from_dict(about["inputs"])
-    scaling = InputScaling(ranges, products=settings.inputs.products, angles=settings.inputs.angles)
     if settings.unified:
-        network = Unified(scaling, settings, graphs, tuple(entry["number"] for entry in about["levels"]))
-        network.scale = float(about["levels"][0]["scale"])
-        take_over(network.state_dict(), load_tensors(folder / "levels.safetensors"))
+        network = Unified(scaling, settings, graphs, tuple(entry["number"] for entry in entries))
+        network.scale = float(entries[0]["scale"])
+        take_over(network.state_dict(), load_tensors(folder / f"{prefix}levels.safetensors"))
         return network
     cascade = Cascade(scaling)
-    for entry in about["levels"]:
+    for entry in entries:
         level = build_level(entry["number"], settings, graphs, cascade)
         level.scale = float(entry["scale"])
         level.at_rest = bool(entry["at_rest"])
-        level.load_own_state(load_tensors(folder / f"level_{entry['number']}.safetensors"))
+        level.load_own_state(load_tensors(folder / f"{prefix}level_{entry['number']}.safetensors"))
         level.settle()
         cascade.add(entry["number"], level)
     return cascade
 
 
-def _scale(core: Network | PodRegression, number: int) -> float:
-    return 1.0 if isinstance(core, PodRegression) else core.scales[number]
-
-
-def _at_rest(core: Network | PodRegression, number: int) -> bool:
+def _about_members(core: Network | PodRegression) -> dict[str, Any]:
+    """Seed and levels of each training that a model is the mean of; nothing for a single one."""
     if isinstance(core, PodRegression):
-        return False
+        return {}
+    from surrogates.models.average import Average
+
+    if not isinstance(core, Average):
+        return {}
+    members = [
+        {"seed": seed, "levels": [{"number": k, **_of_level(member, k)} for k in member.numbers]}
+        for seed, member in zip(core.seeds, core.networks, strict=True)
+    ]
+    return {"members": members, "floor": core.floor}
+
+
+def _of_level(core: Network | PodRegression, number: int) -> dict[str, Any]:
+    """The unit of a level's states, and whether it rests at zero."""
+    if isinstance(core, PodRegression):
+        return {"scale": 1.0, "at_rest": False}
     from surrogates.models.cascade import Cascade
 
-    return isinstance(core, Cascade) and core.levels[number].at_rest
+    return {"scale": core.scales[number], "at_rest": isinstance(core, Cascade) and core.levels[number].at_rest}
 
 
 def _graph_arrays(surrogate: Surrogate) -> dict[str, NDArray[Any]]:

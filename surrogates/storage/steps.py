@@ -7,7 +7,8 @@ Vectors of nodes stand node by node, three coordinates each. Names are those of 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,9 +29,11 @@ _ACTIVATIONS: Mapping[type[nn.Module], str] = {nn.ELU: "elu", nn.SiLU: "silu", n
 
 
 def cascade_steps(
-    cascade: Cascade, levels: list[dict[str, Any]], arrays: dict[str, NDArray[Any]], prefix: str
+    members: Sequence[Cascade], levels: list[dict[str, Any]], arrays: dict[str, NDArray[Any]], prefix: str
 ) -> dict[str, Any]:
-    """Give each of `levels` (see `browser`) its `steps` and `scale`, put numbers into `arrays`; the rest is returned.
+    """Give each of `levels` (see `browser`) its `steps`, put numbers into `arrays`; the rest is returned.
+
+    The steps end in `out`, m, the mean of `outs`, one for each of the `members`.
 
     Raises
     ------
@@ -39,12 +42,19 @@ def cascade_steps(
     """
     writer = _Writer(arrays, prefix)
     for told in levels:
-        level = cascade.levels[told["number"]]
         writer.steps = []
-        with torch.no_grad():
-            writer.decode(level, writer.regress(level), "out")
-        told |= {"steps": writer.steps, "scale": float(level.scale)}
-    inputs = cascade.inputs
+        outs = []
+        for cascade in members:
+            level = cascade.levels[told["number"]]
+            with torch.no_grad():
+                states = writer.decode(level, writer.regress(level))
+            outs.append(writer.add("times", of=states, factor=float(level.scale)))
+        if len(outs) > 1:
+            writer.add("times", "out", of=writer.add("sum", of=outs), factor=1 / len(outs))
+        else:
+            writer.steps[-1]["out"] = "out"
+        told |= {"steps": writer.steps, "outs": outs if len(outs) > 1 else ["out"]}
+    inputs = members[0].inputs
     scaling = {
         "low": inputs.low.tolist(), "high": inputs.high.tolist(), "products": inputs.products, "angles": list(inputs.angles),
     }  # fmt: skip
@@ -52,22 +62,24 @@ def cascade_steps(
 
 
 class _Writer:
-    """Collects steps; a tensor that several levels use is kept once."""
+    """Collects steps; equal tensors, which several levels or trainings use, are kept once."""
 
     def __init__(self, arrays: dict[str, NDArray[Any]], prefix: str) -> None:
         self.arrays, self.prefix = arrays, prefix
         self.steps: list[dict[str, Any]] = []
-        self._kept: dict[tuple[int, str], str] = {}
-        self._alive: list[Any] = []
+        self._kept: dict[tuple[bytes, str], str] = {}
         self._count = 0
 
-    def array(self, tensor: Tensor, kind: str = "", dtype: Any = np.float32) -> str:
-        """The name under which `tensor` is kept."""
-        key = (tensor.data_ptr(), f"{kind}{tuple(tensor.shape)}{tuple(tensor.stride())}")
+    def array(self, tensor: Tensor, dtype: Any = np.float32) -> str:
+        """The name under which `tensor` is kept, row by row."""
+        return self.numbers(np.ascontiguousarray(tensor.detach().cpu().numpy().astype(dtype)).ravel())
+
+    def numbers(self, values: NDArray[Any]) -> str:
+        """The name under which `values` are kept."""
+        key = (hashlib.sha256(values.tobytes()).digest(), values.dtype.str)
         if key not in self._kept:
-            self._alive.append(tensor)  # its memory is not given to another one while its address is a key
             self._kept[key] = f"{self.prefix}t{len(self._kept)}"
-            self.arrays[self._kept[key]] = np.ascontiguousarray(tensor.detach().cpu().numpy().astype(dtype)).ravel()
+            self.arrays[self._kept[key]] = values
         return self._kept[key]
 
     def add(self, step: str, out: str = "", **values: Any) -> str:
@@ -144,7 +156,7 @@ class _Writer:
 
     # ------------------------------------------------------------------------------------------ decoding
 
-    def decode(self, level: LevelNetwork, z: str, out: str = "") -> str:
+    def decode(self, level: LevelNetwork, z: str) -> str:
         """States of `level` from z, in its own unit."""
         made = self.reduction(level.reduction, z)
         if level.coarse is not None and level.upsampling is not None:
@@ -157,7 +169,7 @@ class _Writer:
             zero = next(level.reduction.parameters()).new_zeros(1, level.latent)
             rest = self.at_zero(level, zero)
             made = self.add("minus", of=made, array=self.array(rest))
-        return self.add("times", out=out, of=made, factor=1.0) if out else made
+        return made
 
     def at_zero(self, level: LevelNetwork, zero: Tensor) -> Tensor:
         """What a latent vector of zeros is decoded as, which a level at rest takes away: (node, 3)."""
@@ -200,21 +212,15 @@ class _Writer:
 
     def operator(self, layer: ChebConv) -> tuple[str, str]:
         """The graph's operator row by row."""
-        key = (id(layer.operator), "operator")
-        if key not in self._kept:
-            name = self._kept[key] = f"{self.prefix}g{len(self._kept)}"
-            self._alive.append(layer.operator)
-            self.arrays[f"{name}c"], self.arrays[f"{name}e"] = side_by_side(layer.operator.matrix)
-        return f"{self._kept[key]}c", f"{self._kept[key]}e"
+        columns, entries = side_by_side(layer.operator.matrix)
+        return self.numbers(columns), self.numbers(entries)
 
     def lift(self, upsampling: Upsampling, of: str) -> str:
         if upsampling.kind == "linear":
             import scipy.sparse as sp
 
             columns, weights = side_by_side(sp.csr_matrix(upsampling.weight.detach().numpy()))
-            names = [f"{self.prefix}u{len(self._kept)}c", f"{self.prefix}u{len(self._kept)}w"]
-            self._kept[(id(upsampling), "lift")] = names[0]
-            self.arrays[names[0]], self.arrays[names[1]] = columns, weights
+            names = [self.numbers(columns), self.numbers(weights)]
         else:
             names = [self.array(upsampling.columns, dtype=np.uint32), self.array(upsampling.weight)]
         bias = None if upsampling.kind == "static" else self.array(upsampling.bias)

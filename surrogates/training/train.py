@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from fnmatch import fnmatchcase
 
 import numpy as np
@@ -16,6 +16,7 @@ from surrogates.data.inputs import Ranges
 from surrogates.data.samples import LevelRuns, Notes, check, everything, split
 from surrogates.data.scaling import InputScaling
 from surrogates.errors import SurrogateError
+from surrogates.models.average import Average, some_states, spread_of
 from surrogates.models.cascade import Cascade
 from surrogates.models.curves import fit_curve
 from surrogates.models.pod_regression import PodFit, fit_pod_regression
@@ -28,6 +29,7 @@ from surrogates.surrogate import Surrogate
 from surrogates.training.beside import check_targets, fit_beside
 from surrogates.training.by_folds import FoldTrainer, chooses_by_folds
 from surrogates.training.loop import Diverged, Epoch, Keeper, device_of
+from surrogates.training.members import averaged, fits_together, trainer_of
 from surrogates.training.refinement import Refined
 from surrogates.training.trainer import Trainer
 from surrogates.uncertainty import FEWEST_BY_FOLDS, FEWEST_RUNS, Beliefs, calibrate_gathered, gather
@@ -36,6 +38,12 @@ _log = logging.getLogger(__name__)
 
 # Told of each left-out run: the surrogate as far as it is, the place of the run, its displacements (state, node, 3), m.
 Watch = Callable[[Surrogate, int, NDArray[np.float32]], None]
+
+# A trained model, and what trained it: one, or one for each seed.
+Member = tuple[Surrogate, Trainer]
+
+# Share of the error below which what trainings differ by is nothing: their mean is better by its square at most.
+_NOTHING = 0.02
 
 # Bytes of one run on the full mesh up to which lifted predictions are judged.
 _LARGEST_RUN = 2 << 30
@@ -94,15 +102,17 @@ def train_surrogate(
     surrogate = Surrogate(settings, record, graphs, Cascade(scaling(settings, ranges)), campaign.points, campaign.faces)
     surrogate.labels = campaign.labels
     if of_pod:
+        if settings.seeds > 1:
+            notes.add(
+                f"{settings.model} is trained once and not {settings.seeds} times: its seed draws the folds alone, so an "
+                "average over seeds brings nothing; mh, podnn, aenn and gaenn have weights that differ by it"
+            )
         _fit_regression(surrogate, trainer, wanted, watch)
         return surrogate
     if by_folds:
         trainer = _registered(surrogate, trainer)
     _fit_curves(surrogate, campaign, settings, parts.training, wanted)
-    if settings.unified:
-        _fit_unified(surrogate, trainer, watch)
-    else:
-        _fit_cascade(surrogate, trainer, watch)
+    _judge(surrogate, _fit_members(surrogate, trainer), watch)
     fit_beside(surrogate, campaign, settings, parts.training, notes)
     return surrogate
 
@@ -241,7 +251,52 @@ def _judge_by_folds(surrogate: Surrogate, trainer: Trainer, found: PodFit, watch
     surrogate.bands[0, False] = calibrate_gathered(gathered, record.time, beliefs, np.array(places))
 
 
-def _fit_unified(surrogate: Surrogate, trainer: Trainer, watch: Watch | None) -> None:
+def _fit_members(surrogate: Surrogate, trainer: Trainer) -> list[Member]:
+    """Train once for each seed, and put the network, or the mean of all, on `surrogate`; whole members are kept."""
+    settings, record = trainer.settings, surrogate.record
+    fit = _fit_unified if settings.unified else _fit_cascade
+    if settings.seeds == 1:
+        fit(surrogate, trainer)
+        return [(surrogate, trainer)]
+    members: list[Member] = []
+    stopped = False
+    for place in range(settings.seeds):
+        own, mine = trainer_of(trainer, place), surrogate.untrained()
+        try:
+            fit(mine, own)
+        except Diverged as error:
+            if not members:
+                raise
+            trainer.notes.add(f"the training with seed {own.settings.seed} is left out: {error}")
+            continue
+        except KeyboardInterrupt:
+            if not members:
+                raise
+            stopped = True
+            break
+        stopped = not _whole(mine, own)
+        if not stopped or not members:
+            members.append((mine, own))
+        if stopped:
+            break
+    if stopped:
+        trainer.notes.add(
+            f"was interrupted: what is kept is {len(members)} of {settings.seeds} trainings"
+            + ("" if len(members) > 1 else ", as far as it went")
+        )
+    surrogate.core = averaged(members) if len(members) > 1 else members[0][0].core
+    record.fits |= fits_together(members, interrupted=stopped)
+    return members
+
+
+def _whole(member: Surrogate, trainer: Trainer) -> bool:
+    """Whether no level of a trained member is missing or was interrupted."""
+    wanted = level_numbers(trainer.settings, trainer.graphs)
+    ended = [kept.status for kept in member.record.fits.values()]
+    return set(member.core.numbers) == set(wanted) and "interrupted" not in ended
+
+
+def _fit_unified(surrogate: Surrogate, trainer: Trainer) -> None:
     numbers = level_numbers(trainer.settings, trainer.graphs)
     inputs = scaling(trainer.settings, surrogate.record.ranges)
     try:
@@ -254,10 +309,9 @@ def _fit_unified(surrogate: Surrogate, trainer: Trainer, watch: Watch | None) ->
     finally:
         if isinstance(surrogate.core, Unified):
             surrogate.core.cpu()
-    _judge(surrogate, trainer, watch)
 
 
-def _fit_cascade(surrogate: Surrogate, trainer: Trainer, watch: Watch | None) -> None:
+def _fit_cascade(surrogate: Surrogate, trainer: Trainer) -> None:
     """Level after level; what is finished stays on `surrogate`, whatever happens to the next one."""
     cascade, record = surrogate.core, surrogate.record
     if not isinstance(cascade, Cascade):
@@ -287,70 +341,122 @@ def _fit_cascade(surrogate: Surrogate, trainer: Trainer, watch: Watch | None) ->
             raise
     finally:
         cascade.cpu()
-    _judge(surrogate, trainer, watch)
 
 
 # A run, and the distances (state, node), m, between its truth and what is said of it without it.
 _Judged = tuple[int, NDArray[np.float32]]
 
 
-def _judge(surrogate: Surrogate, trainer: Trainer, watch: Watch | None = None) -> None:
+def _judge(surrogate: Surrogate, members: Sequence[Member], watch: Watch | None = None) -> None:
     """Note errors e2 (m) over runs that were left out, and calibrate the bands on them: on own nodes, and lifted."""
+    trainer, record = members[0][1], surrogate.record
     if isinstance(trainer, FoldTrainer):
-        surrogate.record.choice = _choices(surrogate, trainer)
+        record.choice = _choices(members)
     elif not len(trainer.split.validation):
         trainer.notes.add("no runs were held out, so there is neither a validation error nor a band")
         return
     full = _full_field(trainer)
+    deviations = _deviations(surrogate, members)
     for name, number in surrogate.level_names.items():
         runs = trainer.judged(number, surrogate.graphs)
         reduced: list[float] = []
+        alone: list[list[float]] = [[] for _ in members]
 
-        def own(number: int = number, runs: LevelRuns = runs, reduced: list[float] = reduced) -> Iterator[_Judged]:
-            for run, predicted in _left_out(surrogate, trainer, number):
+        def own(
+            number: int = number, runs: LevelRuns = runs, reduced: list[float] = reduced, alone: list[list[float]] = alone
+        ) -> Iterator[_Judged]:  # fmt: skip
+            for run, said in _left_out(members, number):
+                predicted = _mean_of(said)
                 if watch is not None and number == min(surrogate.core.numbers):
                     watch(surrogate, run, surrogate.lift(predicted, number))
                 truth = runs.read(run)
                 reduced.append(_mean(_off(surrogate.reconstruct(truth, number), runs, run)))
+                for errors, one in zip(alone, said, strict=True):
+                    errors.append(_mean(_off(one, runs, run)))
                 yield run, _off(predicted, runs, run)
 
         def lifted(number: int = number) -> Iterator[_Judged]:
-            for run, predicted in _left_out(surrogate, trainer, number):
+            for run, said in _left_out(members, number):
                 if full is not None:
-                    yield run, _off(predicted, full, run, lambda some: surrogate.lift(some, number))
+                    yield run, _off(_mean_of(said), full, run, lambda some: surrogate.lift(some, number))
 
-        _note(surrogate, trainer, name, (number, False), own())
+        _note(surrogate, trainer, name, (number, False), own(), deviations)
         if full is not None and number > 0:
-            _note(surrogate, trainer, f"{name}, lifted to the full mesh", (number, True), lifted())
-        surrogate.record.errors[f"{name}, reduction alone"] = float(np.mean(reduced))
+            _note(surrogate, trainer, f"{name}, lifted to the full mesh", (number, True), lifted(), deviations)
+        record.errors[f"{name}, reduction alone"] = float(np.mean(reduced))
+        if len(members) > 1:
+            for (_, own_trainer), errors in zip(members, alone, strict=True):
+                record.members.setdefault(str(own_trainer.settings.seed), {})[name] = float(np.mean(errors))
 
 
-def _left_out(surrogate: Surrogate, trainer: Trainer, number: int) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    """Runs, and what is said of them (state, node, 3), m, without them."""
-    if isinstance(trainer, FoldTrainer) and isinstance(surrogate.core, Cascade):
-        yield from enumerate(trainer.left_out(number, surrogate.core.levels[number]))
+def _left_out(members: Sequence[Member], number: int) -> Iterator[tuple[int, list[NDArray[np.float32]]]]:
+    """Runs, and what each member says of them (state, node, 3), m, without them."""
+    of_members = [_left_out_by(member, trainer, number) for member, trainer in members]
+    for told in zip(*of_members, strict=True):
+        yield told[0][0], [said for _, said in told]
+
+
+def _left_out_by(member: Surrogate, trainer: Trainer, number: int) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    if isinstance(trainer, FoldTrainer) and isinstance(member.core, Cascade):
+        yield from enumerate(trainer.left_out(number, member.core.levels[number]))
         return
     for run in trainer.split.validation:
-        yield int(run), _predicted(surrogate, trainer.campaign, run, number)
+        yield int(run), _predicted(member, trainer.campaign, run, number)
 
 
-def _choices(surrogate: Surrogate, trainer: FoldTrainer) -> dict[str, str]:
-    """What was chosen for each level, from what, in words."""
+def _mean_of(said: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+    return said[0] if len(said) == 1 else np.mean(said, axis=0, dtype=np.float32)
+
+
+def _deviations(surrogate: Surrogate, members: Sequence[Member]) -> NDArray[np.float64]:
+    """(judged run,): how far members lie apart, as bands may follow it; 1 for a single training.
+
+    Where that is nothing beside their errors, it is noted that the seed brings nothing.
+    """
+    trainer, core = members[0][1], surrogate.core
+    if not isinstance(core, Average):
+        return np.ones(len(trainer.judged_campaign.parameters))
+    number = max(core.numbers)
+    runs = trainer.judged(number, surrogate.graphs)
+    places, spreads, errors = [], [], []
+    for run, said in _left_out(members, number):
+        some = some_states(len(said[0]))
+        places.append(run)
+        spreads.append(spread_of([one[some] for one in said]))
+        errors.append(_mean(_off(_mean_of(said), runs, run)))
+    spread = np.array(spreads) / surrogate.registration.clock.size(trainer.judged_campaign.parameters[places])
+    core.floor = 0.5 * float(spread.mean())
+    if np.mean(spreads) < _NOTHING * np.mean(errors):
+        core.floor = max(float(np.mean(errors)), 1e-9)  # far above the spread, so that no band follows it
+        trainer.notes.add(
+            f"the {len(members)} trainings differ by {100 * np.mean(spreads):.1g} cm, their error is "
+            f"{100 * np.mean(errors):.2g} cm: with these settings the seed changes next to nothing, and one training does as well"
+        )
+    return core.deviation(spread)
+
+
+def _choices(members: Sequence[Member]) -> dict[str, str]:
+    """What was chosen for each level, from what, in words; by seed where there are several."""
     out = {}
-    for name, number in surrogate.level_names.items():
-        chosen, fit = trainer.chosen[number], surrogate.record.fits[number]
+    of_all = ((member, trainer, *told) for member, trainer in members for told in member.level_names.items())
+    for member, trainer, name, number in of_all:
+        if not isinstance(trainer, FoldTrainer):
+            continue
+        chosen, fit = trainer.chosen[number], member.record.fits[number]
         tried = ", ".join(f"{what} {100 * error:.2f} cm" for what, error in chosen.errors.items())
         epochs = f"; network {fit.best_epoch} of {fit.epochs} epochs" if chosen.share < 1 and fit.epochs else ""
         trained = (
             f"; reduction {chosen.reduction_epochs} epochs" if chosen.reduction_epochs else "; reduction as computed"
         )
-        out[name] = f"{chosen.told} ({tried}){epochs}{trained}"
+        label = name if len(members) == 1 else f"{name}, seed {trainer.settings.seed}"
+        out[label] = f"{chosen.told} ({tried}){epochs}{trained}"
     return out
 
 
 def _note(
-    surrogate: Surrogate, trainer: Trainer, label: str, band: tuple[int, bool], judged: Iterable[_Judged]
-) -> None:
+    surrogate: Surrogate, trainer: Trainer, label: str, band: tuple[int, bool], judged: Iterable[_Judged],
+    deviations: NDArray[np.float64],
+) -> None:  # fmt: skip
     """The error, and the band where runs are enough, from distances on runs that were left out."""
     record, campaign = surrogate.record, trainer.judged_campaign
     places: list[int] = []
@@ -366,7 +472,8 @@ def _note(
     record.errors[label] = float(np.mean(errors))
     by_folds = isinstance(trainer, FoldTrainer)
     if by_folds and band == (min(surrogate.core.numbers), False):
-        record.left_out = {name: (error, 1.0) for name, error in zip(record.fitted_runs, errors, strict=True)}
+        told = zip(record.fitted_runs, errors, deviations, strict=True)
+        record.left_out = {name: (error, float(deviation)) for name, error, deviation in told}
     fewest = FEWEST_BY_FOLDS if by_folds else FEWEST_RUNS
     if len(places) < fewest:
         kind = "training" if by_folds else "validation"
@@ -374,7 +481,7 @@ def _note(
         return
     parameters = campaign.parameters[places]
     sizes = surrogate.registration.clock.size(parameters)
-    beliefs = Beliefs(sizes, np.ones(len(places)), *surrogate.places(parameters))
+    beliefs = Beliefs(sizes, deviations[: len(places)], *surrogate.places(parameters))
     surrogate.bands[band] = calibrate_gathered(gathered, record.time, beliefs)
 
 
@@ -392,7 +499,7 @@ def node_errors(surrogate: Surrogate, trainer: Trainer, number: int) -> NDArray[
     runs: LevelRuns = trainer.judged(number, surrogate.graphs)
     total = np.zeros(surrogate.graphs.n_nodes(number))
     if isinstance(trainer, FoldTrainer):
-        told = list(_left_out(surrogate, trainer, number))
+        told = list(_left_out_by(surrogate, trainer, number))
         mean: NDArray[np.float64] = np.mean(
             [np.nanmean(_off(said, runs, run), axis=0) for run, said in told], axis=0, dtype=np.float64
         )

@@ -497,3 +497,19 @@ def test_what_a_killed_training_left_is_named(crash: Path, tmp_path: Path) -> No
         r"note: \.old\.training .* is left of a training that was killed: it goes on with -o .*old --resume", err
     )
     assert f"next     crashkit evaluate {crash} {tmp_path / 'm'} -o report" in err
+
+
+def test_several_trainings_are_one_model(crash: Path, tmp_path: Path) -> None:
+    few = ("--set", "level.regression=network", "--set", "levels=[2]", "--epochs", 1, "--test", "8:10")
+    code, out, err = run("train", crash, "-o", tmp_path / "mean", "--seeds", 2, *few)
+    assert code == 0, err
+    said = " ".join((out + err).split())
+    assert "2 trainings, one after the other: 2 times the time of one" in said
+    assert "MH2: the mean of 2 trainings has" in said
+    assert load(tmp_path / "mean").seeds == (0, 1)
+    code, out, _ = run("info", tmp_path / "mean")
+    assert "seeds 0 to 1, the mean of 2 trainings" in out
+    code, out, _ = run("train", crash, "-o", tmp_path / "mean", "--seeds", 2, *few, "--overwrite", "--json")
+    told = json.loads(out)
+    assert told["seeds"] == [0, 1]
+    assert set(told["errors_of_each_seed_m"]) == {"0", "1"}

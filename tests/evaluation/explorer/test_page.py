@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,14 @@ FLAGS = (
 MODELS = {
     "mh": ["level.epochs=2", "transfer.epochs=1"],
     "gcn": ["level.epochs=2", "level.start=plain", "transfer.upsampling=linear", "inputs.products=true"],
+    "mean": [
+        "level.epochs=2",
+        "level.regression=network",
+        "level.reduction=pod",
+        "level.latent=4",
+        "levels=[2, 1]",
+        "seeds=2",
+    ],
     "pod-gpr": [],
 }
 
@@ -41,7 +50,7 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Su
     """Small models of a plate, as folders and loaded."""
     home, out = tmp_path_factory.mktemp("models"), {}
     for name, told in MODELS.items():
-        surrogate = train_surrogate(plate.campaign(10), settings("mh" if name == "gcn" else name, overrides=told))
+        surrogate = train_surrogate(plate.campaign(10), settings(name if name == "pod-gpr" else "mh", overrides=told))
         save(surrogate, home / name)
         out[name] = (home / name, surrogate)
     return out
@@ -93,9 +102,14 @@ def test_twenty_predictions_of_every_model_and_level_are_those_of_python(
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium or Chrome is installed")
 def test_band_and_warnings_are_those_of_python(models: dict[str, tuple[Path, Surrogate]], tmp_path: Path) -> None:
+    mean = copy.copy(models["mean"][1])
+    mean.bands = {at: replace(band, spread="deviation", local=None) for at, band in mean.bands.items()}
+    save(mean, tmp_path / "mean")
     folds = train_surrogate(plate.folding(), settings("pod-gpr", overrides=plate.PLAIN_PROCESS))
     save(folds, tmp_path / "folds")
-    page = explore([models["mh"][0], models["pod-gpr"][0], tmp_path / "folds"], tmp_path / "crash.html")
+    page = explore(
+        [models["mh"][0], models["pod-gpr"][0], tmp_path / "folds", tmp_path / "mean"], tmp_path / "crash.html"
+    )
     found = in_browser(
         page,
         """
@@ -108,7 +122,9 @@ def test_band_and_warnings_are_those_of_python(models: dict[str, tuple[Path, Sur
         """,
     )
     assert isinstance(found, list)
-    asked = [(s, [22.0, angle, 3e8]) for s in (models["mh"][1], models["pod-gpr"][1], folds) for angle in (0.5, 8.0)]
+    asked = [
+        (s, [22.0, angle, 3e8]) for s in (models["mh"][1], models["pod-gpr"][1], folds, mean) for angle in (0.5, 8.0)
+    ]
     for (width, said), (surrogate, query) in zip(found, asked, strict=True):
         expected = surrogate.band(0.9, [0.02], full=True, parameters=query).max()
         assert width == pytest.approx(float(expected), rel=1e-3)
@@ -116,7 +132,7 @@ def test_band_and_warnings_are_those_of_python(models: dict[str, tuple[Path, Sur
             s for s in said if "outside" not in s
         ]
     assert folds.bands[0, False].spread == "local"
-    assert ["fold" in " ".join(said) for _, said in found] == [False, False, False, False, True, False]
+    assert ["fold" in " ".join(said) for _, said in found] == [*(4 * [False]), True, *(3 * [False])]
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium or Chrome is installed")

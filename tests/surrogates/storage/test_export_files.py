@@ -44,6 +44,13 @@ def test_onnxruntime_predicts_as_the_surrogate_does(
     np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
 
 
+def test_a_mean_of_several_trainings_is_one_file(tmp_path: Path) -> None:
+    chosen = settings("mh", overrides=["level.epochs=1", "level.regression=network", "levels=[2]", "seeds=2"])
+    mean = train_surrogate(plate.campaign(8), chosen)
+    assert mean.seeds == (0, 1)
+    assert export(mean, tmp_path / "model.onnx", 2) <= 1e-4
+
+
 def test_warped_and_logarithmic_inputs_are_known_to_onnxruntime(surrogate: Surrogate, tmp_path: Path) -> None:
     """The numbers of such a model mean nothing, but they are the same."""
     registration = surrogate.registration
