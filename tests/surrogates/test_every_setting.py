@@ -56,6 +56,7 @@ def line(*change: str, on: set[int] = BOTH, given: tuple[str, ...] = (), model: 
 POD = {"model": "pod-gpr", "on": {0}}
 TABLE: dict[str, list[Line]] = {
     "seed": [line("seed=1")],
+    "seeds": [line("seeds=2")],
     "levels": [line("levels=[2]", on=NONE)],
     "level.reduction": [line("level.reduction=ae", "level.hidden=[9]"), line("level.reduction=pod")],
     "level.convolution": [line("level.convolution=gcn"), line("level.convolution=gcn2")],
