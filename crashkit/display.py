@@ -106,3 +106,12 @@ def progress_html(what: str, done: int, total: int, note: str) -> str:
     """The line as HTML; every text is escaped."""
     bar = f'<progress value="{done}" max="{total}"></progress> {done}/{total}' if total else str(done or "")
     return f"<div>{html.escape(what)} {bar} {html.escape(note)}</div>"
+
+
+def seeds_told(seeds: Sequence[int]) -> str:
+    """The seeds of a model in words: seed 0, or the mean of 5 trainings with seeds 0 to 4."""
+    return (
+        f"seed {seeds[0]}"
+        if len(seeds) == 1
+        else f"seeds {seeds[0]} to {seeds[-1]}, the mean of {len(seeds)} trainings"
+    )

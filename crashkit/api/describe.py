@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -264,15 +263,6 @@ def trained_levels(surrogate: Surrogate) -> list[dict[str, Any]]:
         for name, number in surrogate.level_names.items()
         if (fit := surrogate.training(number)) is not None
     ]
-
-
-def seeds_told(seeds: Sequence[int]) -> str:
-    """The seeds of a model in words: seed 0, or the mean of 5 trainings with seeds 0 to 4."""
-    return (
-        f"seed {seeds[0]}"
-        if len(seeds) == 1
-        else f"seeds {seeds[0]} to {seeds[-1]}, the mean of {len(seeds)} trainings"
-    )
 
 
 def what_the_mean_is_worth(surrogate: Surrogate) -> list[str]:

@@ -357,8 +357,7 @@ class Model:
         return out
 
     def _facts(self) -> tuple[str, dict[str, object], tuple[str, ...], list[tuple[object, ...]]]:
-        from crashkit.api.describe import seeds_told
-        from crashkit.display import listed
+        from crashkit.display import listed, seeds_told
 
         record, settings = self.record, self.settings
         spans = (f"{name} {low:.4g} to {high:.4g} {unit}" for name, (low, high, unit) in self.parameters.items())

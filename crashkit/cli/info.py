@@ -7,10 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-from crashkit.api.describe import seeds_told
 from crashkit.cli._console import console, print_json, table, what_next
 from crashkit.cli._progress import Progress
-from crashkit.display import listed
+from crashkit.display import listed, seeds_told
 
 # How values of these units are shown to people: factor and unit. JSON keeps SI.
 _SHOWN = {"Pa": (1e-6, "MPa"), "s": (1e3, "ms"), "m": (1e3, "mm")}
