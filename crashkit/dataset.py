@@ -17,14 +17,16 @@ import xarray as xr
 import crashkit.accessor  # noqa: F401  registers `.crash`
 from crashkit.chunks import RUNS_WITH, damaged_chunk, lost_chunks
 from crashkit.errors import CrashkitError, ReadError
-from crashkit.netcdf import open_netcdf
+from crashkit.netcdf import default_indexes, open_netcdf
 from crashkit.version import __version__
 from data_schema import VARIABLES
 from data_schema import dataset_checksum as _checksum_from
 from data_schema.checksum import digests_of_run, run_checksum
 
 
-def open_dataset(path: str | Path, *, chunks: Literal["stored"] | Mapping[str, int] | None = "stored") -> xr.Dataset:
+def open_dataset(
+    path: str | Path, *, chunks: Literal["stored"] | Mapping[str, int] | None = "stored", indexes: bool = True
+) -> xr.Dataset:
     """The crash dataset at `path`, a `.zarr` folder or `.nc` file; values are read when they are asked for.
 
     Parameters
@@ -32,6 +34,9 @@ def open_dataset(path: str | Path, *, chunks: Literal["stored"] | Mapping[str, i
     chunks
         "stored": as Dask arrays in the chunks of the store, so that sums over all runs stay small in memory, or
         without Dask where that is not installed; sizes by dimension for other chunks; None for no Dask.
+    indexes
+        Whether runs and times have indexes, which `.sel` needs. Making them imports Pint and Dask where they are
+        installed, which takes longer than opening. Without them, names stay objects as the store gives them.
 
     Raises
     ------
@@ -48,9 +53,11 @@ def open_dataset(path: str | Path, *, chunks: Literal["stored"] | Mapping[str, i
         chunks = {} if importlib.util.find_spec("dask") else None
     try:
         if is_folder:
-            dataset = xr.open_dataset(path, chunks=chunks, engine="zarr", consolidated=False)
+            dataset = xr.open_dataset(
+                path, chunks=chunks, engine="zarr", consolidated=False, **default_indexes(indexes)
+            )
         else:
-            dataset = open_netcdf(path, chunks=chunks)
+            dataset = open_netcdf(path, chunks=chunks, indexes=indexes)
     except Exception as error:  # what a damaged file raises is up to the libraries below
         raise ReadError(
             f"{path}: cannot be opened as a dataset ({_one_line(error)}); expected one made by crashkit ingest"
@@ -71,9 +78,12 @@ def open_dataset(path: str | Path, *, chunks: Literal["stored"] | Mapping[str, i
             raise ReadError(f"{path}: {lost[0]}; copy the dataset again, or ingest the run again")
         for variable in dataset.variables.values():
             variable.attrs.pop(RUNS_WITH, None)  # of the store, not of what it holds
-        out = dataset.assign({n: _as_text(v) for n, v in dataset.variables.items() if v.dtype.kind in "OT"})
+        out = dataset
+        if indexes:  # assigning a coordinate makes its index
+            out = dataset.assign({n: _as_text(v) for n, v in dataset.variables.items() if v.dtype.kind in "OT"})
     out.encoding["source"] = str(path.absolute())  # a dataset in hand finds its mesh hierarchy by it
-    out.set_close(dataset.close)
+    if out is not dataset:
+        out.set_close(dataset.close)
     return out
 
 

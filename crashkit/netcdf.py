@@ -7,6 +7,7 @@ handle of its file is read. So all of this package, and the datasets it gives aw
 from __future__ import annotations
 
 import contextlib
+import inspect
 import shutil
 import threading
 from collections.abc import Iterator
@@ -71,14 +72,22 @@ class SharedFile(FileManager):  # type: ignore[type-arg]
         self.__init__(path)  # type: ignore[misc]
 
 
-def open_netcdf(path: str | Path, group: str | None = None, chunks: Any = None) -> xr.Dataset:
+def default_indexes(wanted: bool) -> dict[str, Any]:
+    """What `xarray.open_dataset` is told so; older versions make them in any case."""
+    import xarray as xr
+
+    known = "create_default_indexes" in inspect.signature(xr.open_dataset).parameters
+    return {} if wanted or not known else {"create_default_indexes": False}
+
+
+def open_netcdf(path: str | Path, group: str | None = None, chunks: Any = None, *, indexes: bool = True) -> xr.Dataset:
     """The dataset, or a group of it, in the file at `path`, through the shared handle."""
     import xarray as xr
 
     shared = SharedFile(path)
     try:
         store = NetCDF4DataStore(shared, group=group, mode="r")
-        dataset = xr.open_dataset(store, chunks=chunks)
+        dataset = xr.open_dataset(store, chunks=chunks, **default_indexes(indexes))
     except BaseException:
         shared.close()
         raise

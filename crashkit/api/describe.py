@@ -59,7 +59,7 @@ def describe(
         return describe_report(path)
     from crashkit.dataset import open_dataset, reading_dataset
 
-    with open_dataset(path, chunks=None) as dataset:
+    with open_dataset(path, chunks=None, indexes=card is not None) as dataset:
         with reading_dataset(path):
             found = describe_dataset(dataset, path)
         if card is not None:
