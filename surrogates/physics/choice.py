@@ -320,7 +320,7 @@ def of_campaign(
     if settings.physics.clock == settings.physics.symmetry == settings.inputs.derived == "off":
         return Registration.identity(campaign.parameter_names, campaign.time), Worth()
     everyone = np.arange(len(campaign.parameters))
-    courses = courses_of(campaign, settings, everyone, notes)
+    courses = courses_of(campaign, settings, everyone, notes, only_judged=True)
     folds = Folds.of(len(everyone), settings.validation.folds, settings.seed)
     trials = Trials(courses, campaign.parameters, folds, "pod-gpr", settings.seed)
     with one_thread():

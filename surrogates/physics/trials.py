@@ -38,6 +38,8 @@ _SMALLEST = 1e-5
 _TRANSLATIONS = 3
 # Modes carried along beside those of the basis, and rows of it worked on at once.
 _KEPT_BESIDE, _ROWS = 16, 1 << 13
+# Nodes that the basis spans where it is only judged with; more say nothing new of a registration.
+_SPANNED = 1 << 15
 # States of a run that the basis is made of, nodes and states on which errors are measured, states of the likelihood.
 _BASIS_STATES = 32
 _JUDGED_NODES, _JUDGED_STATES = 400, 21
@@ -101,11 +103,11 @@ class Courses:
     Attributes
     ----------
     modes
-        (3 * node, mode) float32, orthonormal; the first three are translations.
+        (3 * node, mode) float32, orthonormal; the first three are translations. Of all nodes, or of some.
     own
         (run, state, mode); images (run, state, mode) of each plane.
     nodes
-        Judged nodes, states judged states, truth (run, judged state, judged node, 3), m, and which
+        Places of the judged nodes among those of `modes`, states judged states, truth (run, judged state, judged node, 3), m, and which
         of these nodes are there; None: all.
     """
 
@@ -127,28 +129,37 @@ class Courses:
         mirrors: Sequence[MirrorPlane],
         modes: int,
         seed: int,
+        spanned: int | None = None,
     ) -> Courses:
-        """The runs `chosen`, read twice: once for the basis, once for the coefficients."""
-        length = 3 * runs.nodes
-        count = int(max(8, min(modes, _NUMBERS / length / 3)))
-        basis = _basis(runs, chosen, mirrors, count)
+        """The runs `chosen`, read twice: once for the basis, once for the coefficients.
+
+        Parameters
+        ----------
+        spanned
+            Nodes that the basis has at most, drawn by the seed; None: all.
+        """
+        draw = np.random.default_rng(seed)
+        drawn = draw.permutation(runs.nodes)
+        some = None if spanned is None or runs.nodes <= spanned else np.sort(drawn[:spanned])
+        fields = _Fields(runs, mirrors, some)
+        count = int(max(8, min(modes, _NUMBERS / fields.length / 3)))
+        basis = _basis(fields, chosen, count)
         own = np.empty((len(chosen), runs.states, basis.shape[1]), np.float32)
         images = {k: np.empty_like(own) for k in range(len(mirrors))}
-        draw = np.random.default_rng(seed)
-        nodes = np.sort(draw.permutation(runs.nodes)[:_JUDGED_NODES])
+        judged = np.sort(drawn[:_JUDGED_NODES])
         states = np.unique(np.linspace(0, runs.states - 1, _JUDGED_STATES).astype(int))
-        truth = np.empty((len(chosen), len(states), len(nodes), 3), np.float32)
+        truth = np.empty((len(chosen), len(states), len(judged), 3), np.float32)
         there = np.ones(truth.shape[:3], bool)
         for k, run in enumerate(chosen):
             _log.info("coefficients of run %d of %d", k + 1, len(chosen))
             values = runs.read(run)
-            own[k] = values.reshape(len(values), -1) @ basis
-            truth[k] = values[states][:, nodes]
+            truth[k] = values[states][:, judged]
             known = runs.there(run)
             if known is not None:
-                there[k] = known[states][:, nodes]
-            for plane, mirror in enumerate(mirrors):
-                images[plane][k] = mirrored(mirror, values).reshape(len(values), -1) @ basis
+                there[k] = known[states][:, judged]
+            for plane, part in enumerate(fields.of(values)):
+                (own if plane == 0 else images[plane - 1])[k] = part.reshape(len(part), -1) @ basis
+        nodes = judged if some is None else np.searchsorted(some, judged)
         return cls(
             basis, campaign.time.astype(np.float64), own, images, nodes, states, truth, None if there.all() else there
         )
@@ -323,33 +334,58 @@ def course_machine(
     return Gaussian(x, mixed=[moves.index(k) for k in mixed if k in moves]).fit(some, seed, start)
 
 
-def courses_of(campaign: Campaign, settings: Settings, chosen: NDArray[np.int64], notes: Notes) -> Courses:
-    """The runs `chosen` of the full mesh with the images of all planes."""
+def courses_of(
+    campaign: Campaign, settings: Settings, chosen: NDArray[np.int64], notes: Notes, *, only_judged: bool = False
+) -> Courses:
+    """The runs `chosen` of the full mesh with the images of all planes.
+
+    Parameters
+    ----------
+    only_judged
+        Nothing is predicted with the modes: on a large mesh they have some of its nodes.
+    """
     runs = LevelRuns(campaign, 0, settings, notes)
     modes = max(MODES, max(settings.pod.modes, default=0))
-    return Courses.of(campaign, runs, chosen, campaign.mirrors, modes, settings.seed)
+    spanned = _SPANNED if only_judged else None
+    return Courses.of(campaign, runs, chosen, campaign.mirrors, modes, settings.seed, spanned)
 
 
-def _basis(
-    runs: LevelRuns, chosen: NDArray[np.int64], mirrors: Sequence[MirrorPlane], count: int
-) -> NDArray[np.float32]:
+@dataclass(frozen=True)
+class _Fields:
+    """A run and its images at all planes, on `nodes` (None: all)."""
+
+    runs: LevelRuns
+    mirrors: Sequence[MirrorPlane]
+    nodes: NDArray[np.int64] | None
+
+    @property
+    def length(self) -> int:
+        return 3 * (self.runs.nodes if self.nodes is None else len(self.nodes))
+
+    def of(self, values: NDArray[np.float32]) -> Iterator[NDArray[np.float32]]:
+        """Of some states (state, node of the mesh, 3) of a run: those, then their images."""
+        yield values if self.nodes is None else values[:, self.nodes]
+        for mirror in self.mirrors:
+            yield mirrored(mirror, values, self.nodes)
+
+
+def _basis(fields: _Fields, chosen: NDArray[np.int64], count: int) -> NDArray[np.float32]:
     """(3 * node, mode): the structure as a whole moved along each axis, then the POD of runs and images, of what is
     left without their translation; orthonormal."""
 
     def states() -> Iterator[NDArray[np.float32]]:
         for k, run in enumerate(chosen):
-            _log.info("modes of run %d of %d%s", k + 1, len(chosen), " and its images" if mirrors else "")
-            values = runs.read(run)
+            _log.info("modes of run %d of %d%s", k + 1, len(chosen), " and its images" if fields.mirrors else "")
+            values = fields.runs.read(run)
             values = values[np.unique(np.linspace(0, len(values) - 1, _BASIS_STATES).astype(int))]
-            for image in (None, *mirrors):
-                part = values if image is None else mirrored(image, values)
+            for part in fields.of(values):
                 yield part - part.mean(axis=1, keepdims=True)
 
     found = pod(states(), count, keep=count + _KEPT_BESIDE)
     good = found.singular_values > _SMALLEST * found.singular_values[0]
     moving = int(good.sum()) if good.any() else 0  # nothing moves: one mode of zeros is given
-    out = np.zeros((3 * runs.nodes, _TRANSLATIONS + moving), np.float32)
-    out.reshape(-1, 3, out.shape[1])[:, :, :_TRANSLATIONS] = np.eye(3) / np.sqrt(runs.nodes)
+    out = np.zeros((fields.length, _TRANSLATIONS + moving), np.float32)
+    out.reshape(-1, 3, out.shape[1])[:, :, :_TRANSLATIONS] = np.eye(3) / np.sqrt(fields.length / 3)
     if moving:
         out[:, _TRANSLATIONS:] = found.modes[:, :moving]  # those are the first ones
         del found

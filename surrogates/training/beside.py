@@ -44,7 +44,7 @@ def fit_beside(
     if not wanted and not removal:
         return
     if trials is None:
-        courses = courses_of(campaign, settings, chosen, notes)
+        courses = courses_of(campaign, settings, chosen, notes, only_judged=True)
         folds = Folds.of(len(chosen), settings.validation.folds, settings.seed)
         trials = Trials(courses, campaign.parameters[chosen], folds, "pod-gpr", settings.seed)
     registration = surrogate.registration

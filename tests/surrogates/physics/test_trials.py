@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from surrogates.data.campaign import Campaign
 from surrogates.data.samples import Notes
 from surrogates.models.pod_regression import Inputs, _Candidate, _errors, _held
+from surrogates.physics import trials as module
 from surrogates.physics.clock import Clock
 from surrogates.physics.derived import DerivedInputs
 from surrogates.physics.registration import Registration
@@ -65,6 +66,22 @@ def test_left_out_runs_are_predicted_without_them_and_their_images(
         np.testing.assert_array_equal(after[fold][1], said)
         others = [k for k in range(4) if k != fold]
         assert all(np.abs(after[k][1] - before[k][1]).max() > 1e-3 for k in others)
+
+
+def test_some_nodes_of_a_large_mesh_judge_a_registration_as_all_do(
+    courses: Courses, campaign: Campaign, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = registration(campaign, mirrored=True)
+    monkeypatch.setattr(module, "_SPANNED", 60)
+    monkeypatch.setattr(module, "_JUDGED_NODES", 20)
+    some = courses_of(campaign, CHOSEN["pod-gpr"], np.arange(RUNS), Notes(), only_judged=True)
+    assert len(some.modes) == 3 * module._SPANNED < len(courses.modes)
+    for run in range(RUNS):  # the basis of the same nodes gives the fields that are judged
+        rows = some.modes.reshape(-1, 3, some.modes.shape[1])[some.nodes]
+        said = np.einsum("sm,nxm->snx", some.own[run][some.states], rows)
+        np.testing.assert_allclose(said, some.truth[run], atol=1e-4 * np.abs(some.truth).max())
+    worth = [np.mean(trials(c, campaign, "pod-rbf").errors(known)) for c in (courses, some)]
+    assert worth[1] == pytest.approx(worth[0], rel=0.1)
 
 
 def test_the_kernel_of_a_fold_does_not_know_the_runs_it_leaves_out(courses: Courses, campaign: Campaign) -> None:
