@@ -24,7 +24,7 @@ from torch.nn import functional
 
 from surrogates.errors import SurrogateError
 from surrogates.operators.convolutions import ChebConv, GCN2Conv, GCNConv
-from surrogates.operators.graph import GraphOperator, applied
+from surrogates.operators.graph import WIDE_UP_TO, GraphOperator, applied
 
 
 class _Encode(torch.autograd.Function):
@@ -122,6 +122,8 @@ class GraphEncoder(nn.Module):
         h = self.convolutions(x)
         if operator.form == "dense":
             return functional.linear(h.transpose(0, 1).flatten(1), self.dense.weight, self.dense.bias)
+        if _states_are_smaller(operator, self.dense.out_features, h.shape[1]):
+            return applied(_Encode, h.transpose(1, 2).reshape(-1, h.shape[1]), self.dense.weight, self.dense.bias)
         weight = self.dense.weight.unflatten(1, (operator.n_nodes, -1)).transpose(1, 2).flatten(1)
         return applied(_Encode, h.permute(2, 0, 1).reshape(-1, h.shape[1]), weight, self.dense.bias)
 
@@ -148,9 +150,22 @@ class GraphDecoder(nn.Module):
             h = functional.elu(functional.linear(z, weight, bias))
             states: Tensor = self.convolutions(h.unflatten(1, (self.n_nodes, self.channels)).transpose(0, 1))
             return states
+        if _states_are_smaller(operator, self.dense.in_features, len(z)):
+            h = applied(_Decode, z, weight, bias)
+            x: Tensor = self.convolutions(h.view(self.n_nodes, self.channels, -1).transpose(1, 2))
+            return _by_node(x)
         weight = weight.unflatten(0, (self.n_nodes, self.channels)).transpose(0, 1).flatten(0, 1)
         bias = bias.unflatten(0, (self.n_nodes, self.channels)).t().flatten()
         h = applied(_Decode, z, weight, bias)
-        x: Tensor = self.convolutions(h.reshape(self.channels, self.n_nodes, -1).permute(1, 2, 0))
-        # Gradients want the memory channel by channel; in a prediction, node by node, what follows moves whole rows.
-        return x if torch.is_grad_enabled() else x.transpose(1, 2).contiguous().transpose(1, 2)
+        x = self.convolutions(h.reshape(self.channels, self.n_nodes, -1).permute(1, 2, 0))
+        return _by_node(x)
+
+
+def _states_are_smaller(operator: GraphOperator, latent: int, batch: int) -> bool:
+    """Whether on a large graph a batch of states is put in the order of the dense layer's weights, and not these in its."""
+    return operator.n_nodes > WIDE_UP_TO and batch < latent
+
+
+def _by_node(x: Tensor) -> Tensor:
+    """Gradients want the memory channel by channel; in a prediction, node by node, what follows moves whole rows."""
+    return x if torch.is_grad_enabled() else x.transpose(1, 2).contiguous().transpose(1, 2)

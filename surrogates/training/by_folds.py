@@ -221,6 +221,9 @@ def _sizes(level: LevelNetwork, z: torch.Tensor) -> torch.Tensor:
     step = _STEP * z.std(dim=0).clamp_min(1e-6)
     squares = []
     for middle in z[torch.linspace(0, len(z) - 1, _PLACES).long()]:
-        moved = level.decode(torch.cat([middle[None], middle + torch.diag(step)]))
-        squares.append((moved[:, 1:] - moved[:, :1]).square().mean(dim=(0, 2)))
+        of_middle = []
+        for steps in torch.diag(step).split(max(1, chunk(level.n_nodes) - 1)):
+            moved = level.decode(torch.cat([middle[None], middle + steps]))
+            of_middle.append((moved[:, 1:] - moved[:, :1]).square().mean(dim=(0, 2)))
+        squares.append(torch.cat(of_middle))
     return torch.stack(squares).mean(dim=0).sqrt() / step

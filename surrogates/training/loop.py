@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from surrogates.errors import SurrogateError
 from surrogates.record import HISTORY, Fit
 from surrogates.settings import LevelSettings
+from surrogates.training.best import BestWeights
 
 if TYPE_CHECKING:
     from surrogates.surrogate import Surrogate
@@ -122,9 +123,10 @@ def fit(
     optimiser = _optimiser(objective, settings, device)
     names = _names(objective)
     out = Fit()
-    best: dict[str, Tensor] = {}
+    best = BestWeights(names)
     if keeper is not None and (stored := keeper.load(name)) is not None:
-        best = _restore(stored, names, optimiser, trained, out)
+        _restore(stored, names, best, optimiser, trained, out)
+        del stored
     weights = torch.tensor([settings.weight_approximation, settings.weight_reconstruction], device=device)
     cut = 1 if torch.distributed.is_initialized() else objective.pieces(plan.batch)
     kind = CapturedStep if captured and not torch.distributed.is_initialized() else _Step
@@ -137,6 +139,7 @@ def fit(
             sums = torch.zeros(2, device=device)
             for indices, rate in plan.batches(epoch):
                 sums += step(indices, rate)
+            step.rest()
             measured = _measured(objective, sums / plan.steps, weights)
             out.seconds = spent + time.perf_counter() - started
             if not all(map(math.isfinite, measured.values())):
@@ -147,7 +150,7 @@ def fit(
             judged = measured.get("validation_total", measured["total"])
             if judged < out.best:
                 out.best, out.best_epoch = judged, epoch + 1
-                best = {k: v.detach().clone() for k, v in names.items()}
+                best.keep()
             if report is not None and plan.rank == 0:
                 report(_told(name, settings.epochs, out, objective.scale))
             if (
@@ -155,15 +158,14 @@ def fit(
                 and plan.rank == 0
                 and (keeper.due(epoch + 1) or epoch + 1 == settings.epochs or _enough(out, settings))
             ):
-                keeper.save(name, _tensors(names, best, optimiser, trained), _about(out))
+                keeper.save(name, _tensors(names, best.tensors(), optimiser, trained), _about(out))
     except KeyboardInterrupt:
         if not best:
             raise
         out.status = "interrupted"
     finally:
-        with torch.no_grad():
-            for key, kept in best.items():
-                names[key].copy_(kept)
+        step.rest()
+        best.restore()
     return out
 
 
@@ -265,6 +267,10 @@ class _Step:
         self.optimiser.step()
         return losses
 
+    def rest(self) -> None:
+        """Give back what gradients take, until the next step makes them anew."""
+        self.optimiser.zero_grad(set_to_none=True)
+
 
 class CapturedStep(_Step):
     """A step whose calls are recorded once, as one CUDA graph, and then sent to the device together.
@@ -312,6 +318,9 @@ class CapturedStep(_Step):
                 self.losses = self.taken(self.index)
         self.graph.replay()
         return self.losses.clone()
+
+    def rest(self) -> None:
+        """Gradients belong to the graph."""
 
 
 def _optimiser(objective: Objective, settings: LevelSettings, device: torch.device) -> torch.optim.Optimizer:
@@ -393,11 +402,12 @@ def _about(out: Fit) -> dict[str, Any]:
 def _restore(
     stored: tuple[dict[str, Tensor], dict[str, Any]],
     names: dict[str, Tensor],
+    best: BestWeights,
     optimiser: torch.optim.Optimizer,
     trained: list[nn.Parameter],
     out: Fit,
-) -> dict[str, Tensor]:
-    """Put a stored training back in place; returns the best weights so far."""
+) -> None:
+    """Put a stored training back in place."""
     tensors, about = stored
     with torch.no_grad():
         for key, value in names.items():
@@ -409,8 +419,8 @@ def _restore(
             optimiser.state[parameter] = {k: v.clone().to(parameter.device) for k, v in state.items()}
     out.history, out.best_epoch = about["history"], about["best_epoch"]
     out.best, out.seconds = about["best"], about["seconds"]
-    device = next(iter(names.values())).device
-    return {k: tensors[f"best.{k}"].to(device) for k in names if f"best.{k}" in tensors}
+    if all(f"best.{k}" in tensors for k in names):
+        best.keep({k: tensors[f"best.{k}"] for k in names})
 
 
 def _told(name: str, epochs: int, out: Fit, scale: float) -> Epoch:

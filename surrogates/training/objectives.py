@@ -17,7 +17,7 @@ from surrogates.training.loop import Objective
 
 # Samples handled at once outside training, and how many nodes they may have together: the widest convolution holds some
 # seventy numbers for each, a gradient some three hundred.
-_CHUNK, _NODES, _NODES_IN_TRAINING = 512, 1 << 17, 1 << 19
+_CHUNK, _NODES, _NODES_IN_TRAINING = 512, 1 << 17, 1 << 18
 
 
 def chunk(n_nodes: int) -> int:

@@ -16,6 +16,7 @@ from surrogates.errors import SurrogateError
 from surrogates.record import Fit
 from surrogates.settings import LevelSettings, settings
 from surrogates.training import loop
+from surrogates.training.best import BestWeights
 from surrogates.training.checkpoints import Checkpoints
 from surrogates.training.loop import Diverged, Epoch, Objective, device_of, fit, learning_rates, set_up
 from surrogates.training.objectives import pieces
@@ -290,8 +291,30 @@ def test_a_batch_in_pieces_learns_what_the_whole_one_does() -> None:
 
 def test_a_batch_is_never_cut_into_more_pieces_than_samples() -> None:
     assert pieces(64, 1000) == 1
-    assert pieces(64, 100_000) == 13
+    assert pieces(64, 100_000) == 25
     assert pieces(4, 10_000_000) == 4
+
+
+@pytest.mark.parametrize("in_memory", [0, 1 << 20])
+def test_the_best_weights_come_back_from_memory_and_from_a_file(in_memory: int) -> None:
+    line = Line()
+    live = {name: p.detach() for name, p in line.named_parameters()}
+    best = BestWeights(live, in_memory)
+    best.restore()  # nothing is kept yet
+    assert (bool(best), best.tensors()) == (False, {})
+    for value in (1.0, 2.0):
+        for tensor in live.values():
+            tensor.fill_(value)
+        best.keep()
+    for tensor in live.values():
+        tensor.fill_(3.0)
+    assert {float(t.max()) for t in best.tensors().values()} == {2.0}
+    best.restore()
+    assert {float(t.min()) for t in live.values()} == {2.0}
+    best.keep({name: torch.full_like(t, 5.0) for name, t in live.items()})
+    assert {float(t.min()) for t in live.values()} == {2.0}
+    best.restore()
+    assert {float(t.min()) for t in live.values()} == {5.0}
 
 
 @pytest.mark.parametrize(("clip", "step"), [(0.0, 11.0), (2.0, 2.0), (20.0, 11.0)])
