@@ -83,4 +83,5 @@ class BestWeights:
 
 
 def _bytes_of(tensor: Tensor) -> memoryview:
-    return memoryview(tensor.detach().view(-1).view(torch.uint8).numpy())
+    data: memoryview = tensor.detach().view(-1).view(torch.uint8).numpy().data
+    return data
