@@ -1,18 +1,20 @@
 """What is known before the first run, and what it is worth: each idea alone and left out, and learning curves.
 
     python benchmarks/physics_table.py kart.zarr bumper.zarr --test 96: [--runs 12,24,48,96] [--seeds 5] [-o table.md]
+        [--csv curves.csv]
 
 A POD regression with a Gaussian process is trained on the first runs of each dataset, as many as `--runs` says, with
 everything chosen by cross-validation among these, and with all of it switched off (`inputs.derived`, `physics.clock`,
 `physics.symmetry`). The tables show e2, the mean distance of nodes: in cross-validation over the training runs for each
-idea alone and left out, and on the test runs, which choose nothing and are asked once, with and without all of it.
+idea alone and left out, and on the test runs, which choose nothing and are asked once, with and without all of it. The latter
+as CSV (the first seed) are what `examples/study_driver/curves.py` draws.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -33,18 +35,34 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, default=1, help="trainings of the largest number of runs, seeds 0, 1, ..")
     parser.add_argument("--set", action="append", default=[], help="a setting of both, such as pod.modes=[96]")
     parser.add_argument("-o", "--output", type=Path, help="where the tables go as Markdown; default: the terminal")
+    parser.add_argument("--csv", type=Path, help="where the errors on test runs of one dataset go as CSV")
     options = parser.parse_args(arguments)
+    if options.csv and len(options.datasets) > 1:
+        parser.error("--csv is for one dataset; expected one, or no --csv")
+    found: dict[int, tuple[float, float]] = {}
     lines: list[str] = []
     for dataset in options.datasets:
-        for line in tables(dataset, options.test, options.runs, options.seeds, options.set):
+        for line in tables(dataset, options.test, options.runs, options.seeds, options.set, found):
             print(line, flush=True)
             lines.append(line)
+            if options.csv:
+                options.csv.write_text(curves(found), encoding="utf-8")
     if options.output:
         options.output.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def tables(dataset: Path, test: str, wanted: str, seeds: int, more: Sequence[str]) -> Iterable[str]:
-    """Markdown, line by line, as soon as each is known."""
+def curves(found: Mapping[int, tuple[float, float]]) -> str:
+    """CSV of learning curves, mm, from training runs -> errors without and with physics, m."""
+    lines = ["model,training_runs,mean_node_error_mm"]
+    for k, name in ((1, "POD-GPR"), (0, "POD-GPR without physics")):
+        lines += [f"{name},{runs},{1e3 * errors[k]:.7g}" for runs, errors in found.items()]
+    return "\n".join(lines) + "\n"
+
+
+def tables(
+    dataset: Path, test: str, wanted: str, seeds: int, more: Sequence[str], errors_found: dict[int, tuple[float, float]]
+) -> Iterable[str]:
+    """Markdown, line by line, as soon as each is known; `errors_found` gets what `curves` takes."""
     with open_dataset(dataset) as opened:
         names = [str(name) for name in opened["sim"].values]
     held = runs_of(names, test)
@@ -63,6 +81,7 @@ def tables(dataset: Path, test: str, wanted: str, seeds: int, more: Sequence[str
             surrogate = fitted(dataset, names, training[:count], given)
             seconds = time.perf_counter() - started
             found = errors(surrogate, dataset, held)
+            errors_found.setdefault(count, (float(before), float(np.mean(found))))
             physics = surrogate.record.physics
             worth.setdefault(count, physics["errors"])
             told = " | ".join(str(physics[name]) for name in ("inputs", "clock", "symmetry"))

@@ -89,12 +89,19 @@ class Plan:
         """The test runs, as `crashkit --test` takes them."""
         return f"{self.train}:{self.runs}"
 
+    def few(self, short: bool = False) -> tuple[int, ...]:
+        """The smaller numbers of training runs."""
+        return self.sizes[:1] if short else self.sizes
+
     def jobs(self, seeds: int, short: bool = False) -> list[Job]:
-        """All trainings: the first seed of the table, learning curves, further seeds, what is slow, what else was tried."""
+        """All trainings: the first seed of the table, learning curves, further seeds, what is slow, what else was tried.
+
+        The short ones have one point of the learning curves beside all training runs.
+        """
         shape = quick if short else (lambda kind: kind)
         table = [Job(shape(kind), seed) for seed in range(seeds) for kind in self.table]
         fast = [job for job in table if job.kind.model not in SLOW]
-        curves = [Job(shape(kind), 0, runs) for runs in (None, *self.sizes) for kind in self.curves]
+        curves = [Job(shape(kind), 0, runs) for runs in (None, *self.few(short)) for kind in self.curves]
         other = [] if short else [Job(kind, seed) for kind in self.beside for seed in range(seeds)]
         other += [] if short else [Job(kind) for kind in self.alternatives]
         first = [job for job in fast if job.seed == 0]

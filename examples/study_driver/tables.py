@@ -44,6 +44,12 @@ class LearningCurves:
 
     def draw(self, sheet: Sheet) -> Any:
         figure, (axes,) = sheet.panels(1, height=7.5)
+        self.draw_on(axes, sheet)
+        sheet.legend(figure, axes)
+        return figure
+
+    def draw_on(self, axes: Any, sheet: Sheet) -> None:
+        """The curves on axes that may have a figure of several beside them."""
         for model, errors in self.errors.items():
             style = sheet.style(model)
             known = np.isfinite(errors)
@@ -57,8 +63,6 @@ class LearningCurves:
         axes.set_ylim(bottom=0)
         axes.set_xlabel("training runs")
         axes.set_ylabel(f"mean node error ({self.unit})")
-        sheet.legend(figure, axes)
-        return figure
 
     def caption(self) -> str:
         return "Mean node error on the full mesh, over the same test runs, against the number of training runs."
@@ -98,7 +102,8 @@ class TestRuns:
 
 def learning_curves(study: Study, test: TestRuns) -> LearningCurves:
     """Every kind of the plan's curves, and every level of a cascade, with seed 0; what is not trained is NaN."""
-    sizes: tuple[int | None, ...] = (*study.plan.sizes, None)
+    few = study.plan.few(study.short)
+    sizes: tuple[int | None, ...] = (*few, None)
     errors: dict[str, list[float]] = {}
     for kind in study.plan.curves:
         for k, runs in enumerate(sizes):
@@ -109,7 +114,7 @@ def learning_curves(study: Study, test: TestRuns) -> LearningCurves:
             for name, level in model.level_names.items():
                 found = errors.setdefault(kind.label(name), [np.nan] * len(sizes))
                 found[k] = test.error(lambda p, m=model, k=level: m.predict_full(p, level=k))
-    return LearningCurves((*study.plan.sizes, study.plan.train), errors, study.plan.unit)
+    return LearningCurves((*few, study.plan.train), errors, study.plan.unit)
 
 
 def averaged(study: Study, test: TestRuns, kinds: Sequence[Kind]) -> float:
@@ -253,8 +258,8 @@ def intervals(study: Study, found: Sequence[Row], reference: str) -> Columns:
 def worth(study: Study, kind: Kind) -> Columns:
     """What each idea of physics is worth to `kind` in cross-validation over the training runs, by their number."""
     told: dict[int, Mapping[str, float]] = {}
-    for runs in (*study.plan.sizes, None):
-        job = Job(kind, 0, runs)
+    for runs in (*study.plan.few(study.short), None):
+        job = Job(quick(kind) if study.short else kind, 0, runs)
         if study.trained(job):
             told[runs or study.plan.train] = crashkit.load_model(study.home / job.folder).record.physics["errors"]
     names = dict.fromkeys(name for of in told.values() for name in of)

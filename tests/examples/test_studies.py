@@ -16,7 +16,13 @@ from crashkit.dataset import demo_data
 from evaluation.figures import Sheet
 
 HOME = Path(__file__).parents[2] / "examples"
-DRIVER = ("study_driver", "study_driver.jobs", "study_driver.driver", "study_driver.tables")
+DRIVER = (
+    "study_driver",
+    "study_driver.jobs",
+    "study_driver.driver",
+    "study_driver.tables",
+    "study_driver.curves",
+)
 OWN = ("plan", "study", "results", "rigid")
 STUDIES = ("kart_study", "bumper_study")
 
@@ -178,6 +184,20 @@ def test_learning_curves_are_drawn_from_their_numbers(kart):
     assert lines[0].get_color() == lines[1].get_color() != lines[2].get_color()
     assert lines[0].get_linestyle() != lines[1].get_linestyle()
     assert curves.numbers()["mean_node_error_mm"][:4] == pytest.approx([30.0, 20.0, 50.0, 40.0])
+
+
+def test_curves_of_two_structures_stand_side_by_side_in_their_own_units(kart, tmp_path):
+    tables, side = kart["tables"], kart["curves"]
+    of = {"a": ("cm", [0.03, np.nan]), "b": ("mm", [0.002, 0.001])}
+    for name, (unit, errors) in of.items():
+        written = tables.to_csv(tables.LearningCurves((6, 27), {"POD-GPR": errors, "MH1": [0.5, 0.5]}, unit).numbers())
+        (tmp_path / f"{name}.csv").write_text(written)
+    files = [f"{name}={tmp_path / name}.csv" for name in of]
+    side.main([*files, "-o", str(tmp_path / "both"), "--models", "POD-GPR"])
+    assert (tmp_path / "both.png").stat().st_size > 1000
+    assert (tmp_path / "both.csv").read_text().splitlines()[1:] == [
+        "a,POD-GPR,6,30", "a,POD-GPR,27,", "b,POD-GPR,6,2", "b,POD-GPR,27,1",
+    ]  # fmt: skip
 
 
 def test_ratios_are_taken_between_models_that_are_there(kart):
