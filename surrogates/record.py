@@ -57,6 +57,8 @@ class Record:
     left_out    run -> e2 (m) when it is left out of the training, of the finest level; and the deviation the process
                 then believes in, up to a factor (1 for a cascade). Empty where validation runs judged
     members     seed -> e2 (m) of that training alone, by level, where the model is the mean of several
+    coarse      coarse runs beneath the fine ones: dataset, checksum, runs, nodes, the way they are used, slopes by mode,
+                and e2 (m) of each way in cross-validation; empty without any
     numbers     name -> formula, unit, and the errors of a number on runs that were left out
     notes       what was unusual about the data
     """
@@ -79,6 +81,7 @@ class Record:
     left_out: dict[str, tuple[float, float]] = field(default_factory=dict)
     members: dict[str, dict[str, float]] = field(default_factory=dict)
     numbers: dict[str, dict[str, Any]] = field(default_factory=dict)
+    coarse: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     @classmethod
@@ -137,6 +140,7 @@ def record_from_dict(values: Mapping[str, Any], histories: Mapping[int, dict[str
         left_out={str(k): (float(e), float(d)) for k, (e, d) in values.get("left_out", {}).items()},
         members={str(k): {str(n): float(e) for n, e in v.items()} for k, v in values.get("members", {}).items()},
         numbers={str(k): dict(v) for k, v in values.get("numbers", {}).items()},
+        coarse=dict(values.get("coarse", {})),
         notes=list(values["notes"]),
     )  # fmt: skip
 

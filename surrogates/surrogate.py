@@ -20,6 +20,7 @@ from surrogates.models.curves import Curve
 from surrogates.models.element_field import ElementField, faces_to_level
 from surrogates.models.pod_regression import PodRegression
 from surrogates.models.removal import Removal
+from surrogates.physics.clock import between
 from surrogates.physics.registration import Registration
 from surrogates.record import Fit, Record
 from surrogates.settings import Settings
@@ -65,6 +66,8 @@ class Surrogate:
         How likely elements are gone; None where none was ever removed.
     fields
         Results on elements that were learnt beside the displacements, by name.
+    run_band
+        The band of predictions that start from a coarse run of the query; None where there is none.
     """
 
     def __init__(
@@ -82,6 +85,7 @@ class Surrogate:
         self.labels: Labels | None = None
         self.registration = registration or Registration.identity(record.ranges.names, record.time)
         self.bands: dict[tuple[int, bool], Band] = {}
+        self.run_band: Band | None = None
         self.removal: Removal | None = None
         self.fields: dict[str, ElementField] = {}
         self.curves: dict[str, Curve] = {}
@@ -140,6 +144,42 @@ class Surrogate:
             lambda x, t: self.by_network(x, t, number, lambda states: self._lifted(states, number)), values, times
         )
         return out[0] if np.ndim(parameters) == 1 else out
+
+    def predict_from_coarse(
+        self,
+        parameters: ArrayLike,
+        states: NDArray[np.float32],
+        states_time: NDArray[np.float64],
+        time: ArrayLike | None = None,
+    ) -> NDArray[np.float32]:
+        """`predict` of one run from a run of the same parameters on the coarse mesh: (state, node, 3), m.
+
+        Parameters
+        ----------
+        states
+            (state, coarse node, 3), m, in the order of the coarse runs the model was trained with, at `states_time`, s.
+
+        Raises
+        ------
+        SurrogateError
+            For a model without coarse runs, and as `predict`.
+        """
+        core = self.core
+        values, times = self.checked(parameters, time)
+        if not isinstance(core, PodRegression) or core.base is None:
+            why = "" if not self.record.coarse else ": those it was trained with did not pay"
+            raise SurrogateError(f"the model takes nothing from coarse runs{why}; train pod-gpr with --coarse")
+        if len(values) != 1:
+            raise SurrogateError(f"one coarse run was given for parameters of {len(values)} runs")
+        seen = core.base.project(states, core.modes)
+        clock, grid = self.registration.clock, self.registration.grid
+        course = (
+            between(seen, states_time, grid) if clock.is_identity else clock.apply(seen, values[0], states_time, grid)
+        )
+        out: NDArray[np.float32] = self.registration.undo(
+            lambda x, t: core.displacement(x, t, coarse=course[None]), values, times
+        )[0]
+        return out
 
     def predict_nodes(
         self, parameters: ArrayLike, nodes: NDArray[np.int64], time: ArrayLike | None = None, level: int | None = None
@@ -282,12 +322,13 @@ class Surrogate:
         *,
         full: bool = False,
         parameters: ArrayLike | None = None,
+        from_coarse: bool = False,
     ) -> NDArray[np.float32]:
         """How far, m, the true node may lie from the predicted one: (state, node of `level` or of the full mesh).
 
         The share `coverage` of nodes and states of a new run lies within it, as far as the runs tell that were left
         out; see `surrogates.uncertainty`. With `parameters` (parameter,) it is the band of that run, wider where the
-        model itself knows less; without, that of a typical run.
+        model itself knows less; without, that of a typical run. With `from_coarse` it is that of `predict_from_coarse`.
 
         Raises
         ------
@@ -295,7 +336,7 @@ class Surrogate:
             Where there were too few runs.
         """
         number = self.number(level)
-        found = self.bands.get((number, full and number > 0))
+        found = self.run_band if from_coarse else self.bands.get((number, full and number > 0))
         if found is None:
             raise SurrogateError(
                 f"there is no band for {level_name(self.settings, number)}: too few runs to judge it by; see the model card"

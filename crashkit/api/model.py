@@ -74,6 +74,7 @@ class Model:
         extrapolate: bool = False,
         band: float | None = None,
         sensitivity: bool = False,
+        coarse_run: str | Path | xr.Dataset | None = None,
     ) -> xr.Dataset:
         """Displacements of one run, or of several.
 
@@ -96,6 +97,10 @@ class Model:
             width comes from errors on runs that were left out in training.
         sensitivity
             Also `displacement_by_NAME`: the derivative by each parameter. For one run.
+        coarse_run
+            A run with these parameters on the coarse mesh of a model that was trained with `coarse`, to start from: the
+            folder or file of a solver, `coarse.zarr:run_012`, or a dataset of one run. Displacements and their band use
+            it; what is said of elements, histories and numbers does not.
 
         Returns
         -------
@@ -142,8 +147,17 @@ class Model:
         outside = list(dict.fromkeys(sentence for of_run in beyond for sentence in of_run.values()))
         if sensitivity and len(values) > 1:
             raise DataError(f"sensitivities are those of one run; found parameters of {len(values)}")
+        if coarse_run is not None and (several or sensitivity):
+            raise DataError("a coarse run is that of one prediction, and has no derivative by parameters")
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused below
-            u = surrogate.predict_full(values, at, number) if full else surrogate.predict(values, at, number)
+            if coarse_run is not None:
+                from crashkit.api.coarse_runs import coarse_run_states
+
+                u = surrogate.predict_from_coarse(values, *coarse_run_states(coarse_run, surrogate, values[0]), at)[
+                    None
+                ]
+            else:
+                u = surrogate.predict_full(values, at, number) if full else surrogate.predict(values, at, number)
         if not np.isfinite(u).all():
             raise DataError(
                 "the model gives numbers that are not finite for these parameters; check the values, or train it again"
@@ -153,7 +167,10 @@ class Model:
             warnings.warn(sentence, stacklevel=2)
         arrays: dict[str, tuple[NDArray[Any], str]] = {"displacement": (u, "m")}
         if band is not None:
-            widths = [surrogate.band(band, at, number, full=full, parameters=row) for row in values]
+            started = coarse_run is not None
+            widths = [
+                surrogate.band(band, at, number, full=full, parameters=row, from_coarse=started) for row in values
+            ]
             arrays["half_width"] = (np.stack(widths), "m")
         if sensitivity:
             slopes = surrogate.sensitivity(values[0], at, number)

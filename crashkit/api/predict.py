@@ -57,6 +57,7 @@ def predict(
     extrapolate: bool = False,
     band: float | None = None,
     sensitivity: bool = False,
+    coarse_run: str | Path | xr.Dataset | None = None,
 ) -> xr.Dataset:
     """Displacements of one run, or of several, from a model or the folder it is stored in.
 
@@ -64,12 +65,13 @@ def predict(
     ----------
     model
         As `crashkit.train` or `crashkit.load_model` return it, or the path of its folder.
-    parameters, time, level, full, extrapolate, band, sensitivity
+    parameters, time, level, full, extrapolate, band, sensitivity, coarse_run
         As for `crashkit.Model.predict`, which says what is returned and raised.
     """
     return model_in_hand(model).predict(
-        parameters, time, level, full, extrapolate=extrapolate, band=band, sensitivity=sensitivity
-    )
+        parameters, time, level, full, extrapolate=extrapolate, band=band, sensitivity=sensitivity,
+        coarse_run=coarse_run,
+    )  # fmt: skip
 
 
 def beside_truth(prediction: xr.Dataset, truth: xr.Dataset) -> xr.Dataset:

@@ -126,6 +126,7 @@ def predict_runs(
     sensitivity: bool = False,
     hide_above: float = 0.5,
     template: str | Path | None = None,
+    coarse_run: str | Path | None = None,
     workers: int = 1,
     report: Progress = silent,
 ) -> list[PredictedRun]:
@@ -151,6 +152,9 @@ def predict_runs(
         Elements that are gone with more than this probability are hidden in ParaView files, where no truth says more.
     template
         A d3plot of the same model, whose geometry and units a d3plot gets.
+    coarse_run
+        As for `crashkit.Model.predict`. Without `parameters` they are those that the run itself states; of a table, a
+        folder that holds a run by the name of each row, or a dataset with these runs.
     workers
         Processes that share the rows of a table; the model must then be a folder.
     report
@@ -170,8 +174,14 @@ def predict_runs(
     from crashkit.parallel import as_finished
 
     asked = model_in_hand(model)
+    if coarse_run is not None and table is None and run is None and not parameters:
+        from crashkit.api.coarse_runs import own_parameters
+
+        parameters = own_parameters(coarse_run, asked.record.ranges.names)
     wanted = _wanted(asked.record, Path(output), parameters, table, run, dataset)
-    how = _How(time, level, full, extrapolate, band, sensitivity, hide_above, template)
+    how = _How(
+        time, level, full, extrapolate, band, sensitivity, hide_above, template, coarse_run, several=table is not None
+    )
     if workers == 1 or len(wanted) == 1:
         rows = []
         for k, one in enumerate(wanted):
@@ -202,6 +212,15 @@ class _How:
     sensitivity: bool
     hide_above: float
     template: str | Path | None
+    coarse_run: str | Path | None = None
+    several: bool = False
+
+    def coarse_run_of(self, run: str) -> str | Path | None:
+        """The coarse run that belongs to `run`: of several, the one of its name in what was given."""
+        if self.coarse_run is None or not self.several:
+            return self.coarse_run
+        given = Path(self.coarse_run)
+        return f"{given}:{run}" if given.suffix in (".zarr", ".nc") else given / run
 
 
 def _one(asked: Model, wanted: _Wanted, how: _How) -> PredictedRun:
@@ -214,6 +233,7 @@ def _one(asked: Model, wanted: _Wanted, how: _How) -> PredictedRun:
         prediction = asked.predict(
             wanted.parameters, truth["time"].values if time is None and truth is not None else time, how.level, how.full,
             extrapolate=how.extrapolate, band=how.band, sensitivity=how.sensitivity,
+            coarse_run=how.coarse_run_of(wanted.run),
         )  # fmt: skip
     if truth is not None:
         prediction = beside_truth(prediction, truth)
@@ -221,7 +241,9 @@ def _one(asked: Model, wanted: _Wanted, how: _How) -> PredictedRun:
     about = {"model_name": f"{prediction.attrs['model']} of {asked.name}"} | ({"run": wanted.run} if wanted.run else {})
     files = write_prediction(prediction, wanted.output, about, how.template)
     row = _predicted(wanted, prediction, files, asked.record, how.hide_above)
-    return row if how.band is None else replace(row, band=_band(prediction, how.band, asked))
+    return (
+        row if how.band is None else replace(row, band=_band(prediction, how.band, asked, how.coarse_run is not None))
+    )
 
 
 # The model of a worker, which is loaded once for all its runs.
@@ -238,7 +260,7 @@ def _one_elsewhere(wanted: _Wanted, shared: tuple[Path, _How]) -> PredictedRun:
     return _one(_loaded[folder], wanted, how)
 
 
-def _band(prediction: xr.Dataset, share: float, model: Model) -> PredictedBand:
+def _band(prediction: xr.Dataset, share: float, model: Model, from_coarse: bool = False) -> PredictedBand:
     import numpy as np
 
     from surrogates.storage.tested import held_on_tests
@@ -246,16 +268,18 @@ def _band(prediction: xr.Dataset, share: float, model: Model) -> PredictedBand:
     width, surrogate = prediction["half_width"].values, model.surrogate
     name, full = str(prediction.attrs["model"]), prediction.attrs["level"] == 0
     number = surrogate.level_names[name]
+    behind = surrogate.run_band if from_coarse else surrogate.bands[number, full and number > 0]
     inside = None
     if "error" in prediction:
         error = prediction["error"].values
         inside = float((error <= width)[np.isfinite(error)].mean())
-    held = None if model.folder is None or not full else held_on_tests(model.folder).get(name)
+    tested = model.folder is not None and full and not from_coarse
+    held = held_on_tests(model.folder).get(name) if tested and model.folder is not None else None
     return PredictedBand(
         share=share,
         mean_half_width_m=float(np.nanmean(width)),
         largest_half_width_m=float(np.nanmax(width)),
-        runs_behind=surrogate.bands[number, full and number > 0].runs,
+        runs_behind=behind.runs if behind is not None else 0,
         inside=inside,
         on_test_runs=None if held is None else held.told,
     )

@@ -110,6 +110,7 @@ def steps(study: Study, home: Path) -> list[Step]:
         chosen = {} if options is None else options.set
         settings = [piece for key, value in chosen.items() for piece in ("--set", f"{key}={json.dumps(value)}")]
         config = [] if options is None or options.config is None else [home / options.config]
+        coarse = None if options is None or options.coarse is None else home / options.coarse
         models.append(output / name)
         out.append(
             Step(
@@ -127,7 +128,10 @@ def steps(study: Study, home: Path) -> list[Step]:
                     *settings,
                 ),
                 output / name,
-                depends=lambda config=config: f"{_checksum(data)} {' '.join(coarsen)} {_contents(config)}",  # type: ignore[misc]
+                depends=lambda config=config, coarse=coarse: (  # type: ignore[misc]
+                    f"{_checksum(data)} {' '.join(coarsen)} {_contents(config)}"
+                    + ("" if coarse is None else f" {_checksum(coarse)}")
+                ),
                 again=("--overwrite",),
             )
         )

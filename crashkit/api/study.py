@@ -52,6 +52,7 @@ class ModelStep(_Strict):
     model: ModelName | None = None
     preset: Literal["fast", "paper"] | None = None
     config: Path | None = None
+    coarse: Path | None = None
     set: dict[str, Any] = {}
     epochs: Positive | None = None
     seed: Annotated[int, Field(ge=0)] | None = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -36,6 +37,7 @@ def train(
     epochs: int | None = None,
     test: WhichRuns | None = None,
     targets: Sequence[str] = (),
+    coarse: str | Path | xr.Dataset | None = None,
     hierarchy: Hierarchy | None = None,
     device: str = "auto",
     resume: bool = False,
@@ -74,6 +76,9 @@ def train(
         Runs held out for testing: "27:36", names, a number or a fraction (drawn at random, seeded).
     targets
         What is learnt beside the displacements: "history:wall_force", a channel, a pattern, or the name of a resultant.
+    coarse
+        Dataset of runs of the same structure on a coarser mesh, which help where fine runs are few (pod-gpr). Parts are
+        matched by name or number, parameters by name. Folds over the fine runs decide whether they are used.
     hierarchy
         Mesh hierarchy of a dataset in memory, as `crashkit.coarsen(dataset)` returns it. A dataset on disk has its own.
     device
@@ -137,7 +142,14 @@ def train(
         raise SurrogateError("resume goes on with a training beside its model folder; give output")
     symmetry = chosen.model in ("mh", "podnn", "pod-gpr", "pod-rbf") and chosen.physics.symmetry == "auto"
     odd = chosen.physics.odd or ()
-    campaign = open_campaign(source_of(dataset, hierarchy), test, symmetry=symmetry, odd=odd)
+    source = source_of(dataset, hierarchy)
+    campaign = open_campaign(source, test, symmetry=symmetry, odd=odd)
+    if coarse is not None:
+        from crashkit.api.coarse_runs import coarse_runs
+
+        if chosen.model != "pod-gpr":
+            raise SurrogateError(f"coarse runs go beneath pod-gpr, and the model is {chosen.model}; train pod-gpr")
+        campaign = replace(campaign, coarse=coarse_runs(coarse, campaign, source))
     judge = NumberJudge.of(chosen, campaign)
     state = None if folder is None else folder.with_name(f".{folder.name}.training")
     with (

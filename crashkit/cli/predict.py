@@ -35,6 +35,14 @@ def command(
         str, typer.Option(help="Predict this run of --dataset instead, with the truth beside it.", show_default="none")
     ] = "",
     dataset: Annotated[Path | None, typer.Option(help="Dataset of --run.", show_default="none")] = None,
+    coarse_run: Annotated[
+        str,
+        typer.Option(
+            help="Start from this run of the same parameters on the coarse mesh (models trained with --coarse): a solver's "
+            "folder or file, or coarse.zarr:run_012; with --params a folder or dataset with the rows' runs.",
+            show_default="none",
+        ),
+    ] = "",
     output: Annotated[
         Path,
         typer.Option(
@@ -98,6 +106,7 @@ def command(
             model, output, parameters=asked, table=params, run=run or None,
             dataset=dataset, time=times, level=level, full=full or None, extrapolate=extrapolate, band=band,
             sensitivity=sensitivity, template=template, workers=(os.cpu_count() or 1) if write_series else 1,
+            coarse_run=coarse_run or None,
             hide_above=hide_above, report=shown.step,
         )  # fmt: skip
     if json:

@@ -53,6 +53,13 @@ def command(
             help="What is learnt: displacement, and beside it results on elements (plastic_strain) and histories (history:wall_force)."
         ),
     ] = "displacement",
+    coarse: Annotated[
+        Path | None,
+        typer.Option(
+            help="Dataset of runs on a coarser mesh of the same structure, beneath few fine ones (pod-gpr): coarse.zarr.",
+            show_default="none",
+        ),
+    ] = None,
     epochs: Annotated[
         int | None, typer.Option(help="Epochs of every level.", min=1, show_default="from the settings")
     ] = None,
@@ -89,7 +96,7 @@ def command(
         surrogate = train(
             dataset, output, model or None, preset=preset or None, settings=given, config=config, seed=seed, seeds=seeds,
             epochs=epochs, test=test or None, device=device, resume=resume, overwrite=overwrite,
-            targets=() if targets == "displacement" else names(targets),
+            targets=() if targets == "displacement" else names(targets), coarse=coarse,
             tensorboard=tensorboard, on_epoch=epoch_lines(shown, verbose),
         ).surrogate  # fmt: skip
     if json:

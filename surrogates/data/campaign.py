@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from data_schema.levels import Level
 from data_schema.mirror import MirrorPlane
@@ -117,6 +118,8 @@ class Campaign:
         Channels of time histories that are learnt beside the displacements, and their times (sample,), s.
     known
         (sim, state) whether a run was computed that far; None: all were. Other states are in no loss.
+    coarse
+        Runs of the same structure on a coarser mesh, which help to predict these.
     """
 
     parameters: NDArray[np.float64]
@@ -144,3 +147,20 @@ class Campaign:
     targets: tuple[ElementTarget, ...] = ()
     curves: tuple[CurveTarget, ...] = ()
     curve_time: NDArray[np.float64] | None = None
+    coarse: CoarseRuns | None = None
+
+
+@dataclass(frozen=True)
+class CoarseRuns:
+    """Runs of the same structure on another, coarser mesh.
+
+    Attributes
+    ----------
+    campaign
+        The runs: parameters in the order and units of those of the finer mesh, displacements on their own full mesh.
+    to_fine
+        (node of the finer mesh, node of the coarser one): what a field says at each node, part by part.
+    """
+
+    campaign: Campaign
+    to_fine: sparse.csr_matrix

@@ -16,10 +16,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogates.data.campaign import Campaign
+from surrogates.data.campaign import Campaign, CoarseRuns
 from surrogates.data.inputs import over_range
 from surrogates.data.samples import Notes, scale_of
 from surrogates.errors import SurrogateError
+from surrogates.models.coarse_base import CoarseBase
+from surrogates.models.coarse_fit import CoarseFit, fit_coarse
 from surrogates.physics.choice import Worth, choose, not_used
 from surrogates.physics.registration import Registration
 from surrogates.physics.trials import Courses, Folds, Trials, courses_of, one_thread
@@ -57,6 +59,7 @@ class PodRegression:
 
     modes      (3 * node, mode) float32
     low, high  (p,) ranges that scale the parameters; a constant one is left out
+    base       what coarse runs add to it; then `data` holds what they leave to the fine ones
     """
 
     def __init__(
@@ -68,9 +71,10 @@ class PodRegression:
         low: NDArray[np.float64],
         high: NDArray[np.float64],
         samples: NDArray[np.int64] | None = None,
+        base: CoarseBase | None = None,
     ) -> None:
         self.modes, self.data, self.machine, self.inputs = modes, data, machine, inputs
-        self.low, self.high, self.samples = low, high, samples
+        self.low, self.high, self.samples, self.base = low, high, samples, base
 
     @property
     def numbers(self) -> tuple[int, ...]:
@@ -79,14 +83,25 @@ class PodRegression:
     def latent(self, number: int) -> int:
         return int(self.modes.shape[1])
 
-    def coefficients(self, parameters: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(run, p) and (state,), s -> (run, state, mode), m. Between trained times the course is interpolated."""
+    def coefficients(
+        self,
+        parameters: NDArray[np.float64],
+        time: NDArray[np.float64],
+        coarse: NDArray[np.float64] | None = None,
+    ) -> NDArray[np.float64]:
+        """(run, p) and (state,), s -> (run, state, mode), m. Between trained times the course is interpolated.
+
+        coarse  (run, state of the grid, mode), m: what is taken over from coarse runs at these parameters, where there
+                are some; else the coarse process alone says it
+        """
         x = self.scaled(parameters)
         r = self.modes.shape[1]
         if self.inputs == "trajectory":
-            known = self.data.values.reshape(len(self.data.values), -1)
-            course = self.machine.weights(x) @ known
-            return _at(course.reshape(len(x), -1, r), self.data.time, time)
+            course = _summed(self.machine.weights(x), self.data.values)
+            if self.base is not None:
+                beneath = _summed(self.base.process.weights(x), self.base.values)
+                course += beneath if coarse is None else beneath + self.base.share * (coarse - beneath)
+            return _at(course, self.data.time, time)
         points = np.concatenate(
             [np.repeat(x, len(time), axis=0), np.tile(_scaled_time(time, self.data.time), len(x))[:, None]], axis=1
         )
@@ -95,8 +110,15 @@ class PodRegression:
         return out.reshape(len(x), len(time), r)
 
     def weights(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(run, p) -> (run, training sample): how much each training run enters, where a run is one sample."""
-        return self.machine.weights(self.scaled(parameters))
+        """(run, p) -> (run, training sample): how much each of the `courses` enters, where a run is one sample."""
+        x = self.scaled(parameters)
+        own = self.machine.weights(x)
+        return own if self.base is None else np.concatenate([own, self.base.process.weights(x)], axis=1)
+
+    @property
+    def courses(self) -> NDArray[np.float32]:
+        """(training sample, state, mode), m: fine runs, then coarse ones."""
+        return self.data.values if self.base is None else np.concatenate([self.data.values, self.base.values])
 
     def deviation(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
         """(run, p) -> (run,): what the process believes its error to be, up to a factor; ones where it believes nothing."""
@@ -110,9 +132,10 @@ class PodRegression:
         time: NDArray[np.float64],
         number: int = 0,
         nodes: NDArray[np.int64] | None = None,
+        coarse: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float32]:
-        """(run, p) and (state,) -> (run, state, node, 3), m; with `nodes` on these alone."""
-        return self.decoded(self.coefficients(parameters, time), nodes)
+        """(run, p) and (state,) -> (run, state, node, 3), m; with `nodes` on these alone, `coarse` as for `coefficients`."""
+        return self.decoded(self.coefficients(parameters, time, coarse), nodes)
 
     def decoded(self, z: NDArray[np.float64], nodes: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
         """Coefficients (run, state, mode), m -> displacements (run, state, node, 3), m."""
@@ -133,7 +156,7 @@ class PodRegression:
     def n_parameters(self, number: int = 0) -> int:
         """Modes, the coefficients they are predicted from, and the kernel's numbers."""
         kernel = sum(v.size for v in self.machine.numbers().values())
-        return self.modes.size + self.data.values.size + kernel
+        return self.modes.size + self.courses.size + kernel
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """What has to be stored."""
@@ -146,13 +169,15 @@ class PodRegression:
         return {k: np.ascontiguousarray(v) for k, v in arrays.items()}
 
     @classmethod
-    def load(cls, a: Mapping[str, NDArray[Any]], model: str, inputs: Inputs) -> PodRegression:
-        """From what `arrays` gave."""
+    def load(
+        cls, a: Mapping[str, NDArray[Any]], model: str, inputs: Inputs, base: CoarseBase | None = None
+    ) -> PodRegression:
+        """From what `arrays` gave; what coarse runs add is kept apart."""
         data = Coefficients(a["parameters"], a["time"], a["values"])
         samples = a.get("samples")
         x = data.parameters if inputs == "trajectory" else _points(data)[samples]
         machine = Gaussian.load(x, a) if model == "pod-gpr" else RadialBasis(x)
-        return cls(a["modes"], data, machine, inputs, a["low"], a["high"], samples)
+        return cls(a["modes"], data, machine, inputs, a["low"], a["high"], samples, base)
 
     def scaled(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
         return over_range(parameters, np.stack([self.low, self.high]))
@@ -173,6 +198,8 @@ class PodFit:
 
     trials  what everything was chosen with
     held    calls back with each training run and what the model made without it says of it
+    coarse  what folds said of coarse runs; None without any
+    itself  as `held`, of those that have a coarse run of the same parameters, and starting from it
     """
 
     core: PodRegression
@@ -181,6 +208,8 @@ class PodFit:
     worth: Worth
     held: Callable[[], Iterator[Held]]
     trials: Trials
+    coarse: CoarseFit | None = None
+    itself: Callable[[], Iterator[Held]] | None = None
 
 
 @dataclass(frozen=True)
@@ -208,8 +237,48 @@ def fit_pod_regression(
     trials = Trials(courses, campaign.parameters[chosen], folds, settings.model, settings.seed)
     with one_thread():
         best, core, choice, worth = _chosen(campaign, settings, chosen, trials, notes)
+        coarse = (
+            None if campaign.coarse is None else _beneath(campaign.coarse, best, core, choice, trials, settings, notes)
+        )
     core.modes = np.ascontiguousarray(courses.modes @ core.modes)
-    return PodFit(core, best.registration, choice, worth, lambda: _held(best, trials, settings, choice.modes), trials)
+    fit = PodFit(core, best.registration, choice, worth, lambda: _held(best, trials, settings, choice.modes), trials)
+    if coarse is None:
+        return fit
+    fit.coarse = coarse
+    if coarse.base is not None:
+        fit.held = lambda: _held_over(coarse, core.modes, itself=False)
+        fit.itself = lambda: _held_over(coarse, core.modes, itself=True)
+    return fit
+
+
+def _beneath(
+    coarse: CoarseRuns,
+    candidate: _Candidate,
+    core: PodRegression,
+    choice: PodChoice,
+    trials: Trials,
+    settings: Settings,
+    notes: Notes,
+) -> CoarseFit:
+    """Put coarse runs beneath `core`, if folds show a gain; its modes are those of the common basis still."""
+    turn = _rotation(trials.values(candidate.registration, candidate.plane))
+    count = min(max(settings.pod.modes), trials.courses.own.shape[2])
+    every = turn(trials.courses.own.shape[2])
+    found = fit_coarse(coarse, trials, candidate.registration, candidate.plane, every, count, settings, notes)
+    if found.base is None or found.machine is None or found.values is None:
+        notes.add("coarse runs did not lower the error in cross-validation: the fine runs alone are kept")
+        return found
+    core.modes, core.machine, core.base = every[:, :count], found.machine, found.base
+    core.data.values, choice.modes = found.values, count
+    return found
+
+
+def _held_over(found: CoarseFit, modes: NDArray[np.float32], *, itself: bool) -> Iterator[Held]:
+    """Left-out runs with coarse runs beneath: from what these say elsewhere, or from the coarse run of each."""
+    for run, far, near, deviation in found.held:
+        course = near if itself else far
+        if course is not None:
+            yield Held(run, (course @ modes.T).reshape(len(course), -1, 3), deviation)
 
 
 def _chosen(
@@ -223,7 +292,7 @@ def _chosen(
     candidates = [_Candidate("trajectory", registration, plane)]
     if settings.pod.inputs == "point":
         candidates = [_Candidate("point", Registration.identity(campaign.parameter_names, courses.time), 0)]
-    elif settings.pod.inputs == "auto" and registration.is_identity:
+    elif settings.pod.inputs == "auto" and registration.is_identity and campaign.coarse is None:
         candidates.append(_Candidate("point", registration, 0))
     counts = tuple(sorted({min(m, courses.own.shape[2]) for m in settings.pod.modes}))
     if not len(trials.folds.judged):
@@ -381,6 +450,11 @@ def _at(course: NDArray[np.float64], trained: NDArray[np.float64], time: NDArray
     from scipy.interpolate import PchipInterpolator
 
     return np.asarray(PchipInterpolator(trained, course, axis=1)(np.clip(time, trained[0], trained[-1])))
+
+
+def _summed(weights: NDArray[np.float64], values: NDArray[np.float32]) -> NDArray[np.float64]:
+    """(run, sample) weights of courses (sample, state, mode) -> (run, state, mode)."""
+    return np.asarray((weights @ values.reshape(len(values), -1)).reshape(len(weights), *values.shape[1:]))
 
 
 def _pieces(points: NDArray[np.float64], size: int = 2048) -> Iterable[NDArray[np.float64]]:

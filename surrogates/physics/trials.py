@@ -276,6 +276,10 @@ class Trials:
         values = values[:, registration.grid <= registration.reach * (1 + 1e-9)]
         return course_machine(self.machine, inputs, values, registration.inputs.mixed, self.seed, start)
 
+    def likely(self, registration: Registration, values: NDArray[np.floating]) -> NDArray[np.float64]:
+        """(run, number) of courses (run, state, mode): the states that a process's likelihood counts."""
+        return likely_states(values[:, registration.grid <= registration.reach * (1 + 1e-9)])
+
     def inputs(self, registration: Registration) -> NDArray[np.float64]:
         """(run and image, input)"""
         names = registration.inputs.names
@@ -328,10 +332,14 @@ def course_machine(
     x = over_range(inputs, inputs)
     if name == "pod-rbf":
         return RadialBasis(x)
-    every = max(1, values.shape[1] // _LIKELIHOOD_STATES)
-    some = values[:, ::-every].reshape(len(values), -1).astype(np.float64)
     moves = np.flatnonzero(np.ptp(inputs, axis=0) > 0).tolist()
-    return Gaussian(x, mixed=[moves.index(k) for k in mixed if k in moves]).fit(some, seed, start)
+    return Gaussian(x, mixed=[moves.index(k) for k in mixed if k in moves]).fit(likely_states(values), seed, start)
+
+
+def likely_states(values: NDArray[np.floating]) -> NDArray[np.float64]:
+    """(run, number) of courses (run, state, mode): some states, the last one among them."""
+    every = max(1, values.shape[1] // _LIKELIHOOD_STATES)
+    return values[:, ::-every].reshape(len(values), -1).astype(np.float64)
 
 
 def courses_of(

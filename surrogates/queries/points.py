@@ -92,6 +92,8 @@ class AtPoints:
         lists = [surrogate.record.parameters.get(n, []) for n in surrogate.record.ranges.names]
         if not isinstance(core, PodRegression) or not isinstance(core.machine, Gaussian) or core.inputs != "trajectory":
             return None
+        if core.base is not None:
+            return None
         runs, x = np.array(lists, np.float64).T, core.machine.x
         if len(runs) < 3 or not x.shape[1] or len(x) % len(runs):
             return None
@@ -127,7 +129,7 @@ class AtPoints:
     def _by_process(self, core: PodRegression) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
         """The modes are read at the points once; what is left is the regression of few numbers."""
         here = self._modes_here(core)
-        known, registration = core.data.values.astype(np.float64), self.surrogate.registration
+        known, registration = core.courses.astype(np.float64), self.surrogate.registration
         trajectory = core.inputs == "trajectory"
 
         def courses(parameters: NDArray[np.float64]) -> NDArray[np.float64]:

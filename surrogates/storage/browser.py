@@ -77,6 +77,8 @@ def browsable(surrogate: Surrogate, name: str, prefix: str, share: float = 0.9) 
 def _process(core: PodRegression, arrays: dict[str, NDArray[Any]], quantised: set[str], prefix: str) -> dict[str, Any]:
     if not isinstance(core.machine, Gaussian) or core.inputs != "trajectory":
         raise SurrogateError("only Gaussian processes over whole runs have a form for a browser; train pod-gpr or mh")
+    if core.base is not None:
+        raise SurrogateError("coarse runs beneath fine ones have no form for a browser; train pod-gpr without --coarse")
     known = core.data.values.reshape(len(core.data.values), -1).astype(np.float64)
     mean, pull = core.machine.expanded(known)
     inverse = core.machine.inverse()

@@ -16,6 +16,7 @@ from scipy import sparse
 from surrogates.data.campaign import Labels
 from surrogates.data.graphs import Graphs
 from surrogates.errors import SurrogateError
+from surrogates.models.coarse_base import CoarseBase
 from surrogates.models.curves import Curve
 from surrogates.models.element_field import ElementField
 from surrogates.models.pod_regression import PodRegression
@@ -184,6 +185,20 @@ def check_core(core: Network | PodRegression, graphs: Graphs) -> None:
     for name, tensor in core.state_dict().items():
         if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
             raise SurrogateError(f"weights {name} hold numbers that are not finite")
+
+
+def check_base(base: CoarseBase | None, graphs: Graphs) -> None:
+    """What coarse runs add: a course for each sample of their process, a slope for each mode, and the map from their mesh."""
+    if base is None:
+        return
+    samples = len(numbers("inputs of the coarse runs", base.process.x, (None, None)))
+    slopes = numbers("slopes of the coarse runs", base.slopes, (None,))
+    numbers("values of the coarse runs", base.values, (samples, None, len(slopes)))
+    nodes = len(numbers("position of the coarse mesh", base.position, (None, 3)))
+    numbers("node_id of the coarse mesh", base.node_id, (nodes,))
+    whole_matrix("the map from the coarse mesh", base.to_fine)
+    if base.to_fine.shape[0] != graphs.n_full:
+        raise SurrogateError(f"the map from the coarse mesh has {base.to_fine.shape[0]} rows; expected {graphs.n_full}")
 
 
 def check_elements(removal: Removal | None, fields: Mapping[str, ElementField], n_faces: int, states: int) -> None:

@@ -5,6 +5,7 @@
                            several trainings, seed_0.level_3.safetensors .. of each
     graphs.safetensors     the levels' graphs and maps, and the full mesh, so that it lifts and draws without the data
     elements.safetensors   what is said of elements: their removal, plastic strain and the like; where there is any
+    coarse.safetensors     what coarse runs add to a POD regression, where there is any
     bands.safetensors      how far predictions may be wrong, from the validation runs
     curves.safetensors     time histories, where they were learnt
     history.json           losses by epoch and level
@@ -34,6 +35,7 @@ from surrogates.data.campaign import Labels
 from surrogates.data.graphs import Graphs
 from surrogates.errors import ModelFolderError, SurrogateError
 from surrogates.local_errors import LocalErrors
+from surrogates.models.coarse_base import CoarseBase
 from surrogates.models.curves import Curve
 from surrogates.models.element_field import ElementField
 from surrogates.models.pod_regression import PodRegression
@@ -44,6 +46,7 @@ from surrogates.settings import Settings, parse
 from surrogates.storage.card import card
 from surrogates.storage.checks import (
     check_bands,
+    check_base,
     check_core,
     check_curves,
     check_elements,
@@ -64,6 +67,8 @@ _MAIN = "model.json"
 _ELEMENTS = "elements.safetensors"
 _SPREADS: tuple[Spread, ...] = ("constant", "size", "deviation", "local")
 _CURVES = "curves.safetensors"
+_COARSE = "coarse.safetensors"
+_OF_RUNS = "0.run."
 _LABELS = ("node_id", "face_part", "part_id", "face_id")
 
 
@@ -124,9 +129,14 @@ def load(folder: str | Path) -> Surrogate:
         graphs, points, faces = _graphs(stored)
         check_record(record)
         check_graphs(graphs, points, faces)
-        core = _core(folder, about, settings, record, graphs)
+        base = CoarseBase.load(load_file(folder / _COARSE)) if _COARSE in files else None
+        check_base(base, graphs)
+        core = _core(folder, about, settings, record, graphs, base)
         registration = Registration.from_dict(about["registration"])
-        bands = _bands(load_file(folder / "bands.safetensors"), record)
+        stored_bands = load_file(folder / "bands.safetensors")
+        bands = _bands({k: v for k, v in stored_bands.items() if not k.startswith(_OF_RUNS)}, record)
+        of_runs = _bands({k: v for k, v in stored_bands.items() if k.startswith(_OF_RUNS)}, record)
+        check_bands(of_runs, graphs, record)
         labels = _labels(stored, about)
         check_bands(bands, graphs, record)
         curves = _curves(load_file(folder / _CURVES) if _CURVES in files else {}, about.get("curves", {}))
@@ -145,6 +155,7 @@ def load(folder: str | Path) -> Surrogate:
         said = " ".join(str(error).split())[:200] or type(error).__name__
         raise ModelFolderError(f"{folder}: does not hold together ({said}); train it again") from error
     surrogate.bands = bands
+    surrogate.run_band = next(iter(of_runs.values()), None)
     surrogate.labels = labels
     surrogate.removal, surrogate.fields = elements
     surrogate.curves = curves
@@ -155,6 +166,8 @@ def _write(surrogate: Surrogate, folder: Path) -> None:
     record, core = surrogate.record, surrogate.core
     if isinstance(core, PodRegression):
         save_file(core.arrays(), folder / "pod.safetensors")
+        if core.base is not None:
+            save_file({k: np.ascontiguousarray(v) for k, v in core.base.arrays().items()}, folder / _COARSE)
     else:
         from safetensors.torch import save_file as save_tensors
 
@@ -215,10 +228,10 @@ def _about(folder: Path) -> dict[str, Any]:
 
 
 def _core(
-    folder: Path, about: Mapping[str, Any], settings: Settings, record: Record, graphs: Graphs
+    folder: Path, about: Mapping[str, Any], settings: Settings, record: Record, graphs: Graphs, base: CoarseBase | None
 ) -> Network | PodRegression:
     if settings.model in ("pod-gpr", "pod-rbf"):
-        return PodRegression.load(load_file(folder / "pod.safetensors"), settings.model, record.choice["inputs"])
+        return PodRegression.load(load_file(folder / "pod.safetensors"), settings.model, record.choice["inputs"], base)
     from surrogates.data.scaling import InputScaling
     from surrogates.models.average import Average
 
@@ -345,12 +358,14 @@ def _curves(stored: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> dic
 
 def _band_arrays(surrogate: Surrogate) -> dict[str, NDArray[Any]]:
     out: dict[str, NDArray[Any]] = {}
-    for (number, lifted), band in surrogate.bands.items():
+    bands = {f"{number}.{'full' if lifted else 'own'}.": band for (number, lifted), band in surrogate.bands.items()}
+    if surrogate.run_band is not None:
+        bands[_OF_RUNS] = surrogate.run_band
+    for prefix, band in bands.items():
         arrays: dict[str, NDArray[Any]] = {"node": band.node, "state": band.state, "factor": band.factor}
         if band.local is not None:
             arrays |= {"points": band.local.points, "ratio": band.local.ratio, "run": band.local.run}
             arrays["width"] = np.array([band.local.width])
-        prefix = f"{number}.{'full' if lifted else 'own'}."
         out |= {prefix + k: np.ascontiguousarray(v) for k, v in arrays.items()}
         out[prefix + "runs"] = np.array([band.runs])
         out[prefix + "spread"] = np.array([_SPREADS.index(band.spread)])

@@ -52,6 +52,8 @@ class Checkpoints:
             "settings": settings.as_dict(), "data": campaign.checksum, "runs": list(campaign.runs),
             "mesh hierarchy": _digest(campaign),
         }  # fmt: skip
+        if campaign.coarse is not None:
+            identity["coarse runs"] = [campaign.coarse.campaign.checksum, *campaign.coarse.campaign.runs]
         self.fingerprint = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]
         if resume:
             self._check(identity)

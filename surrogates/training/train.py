@@ -19,7 +19,7 @@ from surrogates.errors import SurrogateError
 from surrogates.models.average import Average, some_states, spread_of
 from surrogates.models.cascade import Cascade
 from surrogates.models.curves import fit_curve
-from surrogates.models.pod_regression import PodFit, fit_pod_regression
+from surrogates.models.pod_regression import Held, PodFit, fit_pod_regression
 from surrogates.models.unified import Unified
 from surrogates.physics.choice import of_campaign
 from surrogates.physics.trials import Folds
@@ -28,11 +28,12 @@ from surrogates.settings import Settings
 from surrogates.surrogate import Surrogate
 from surrogates.training.beside import check_targets, fit_beside
 from surrogates.training.by_folds import FoldTrainer, chooses_by_folds
+from surrogates.training.coarse import check_coarse, note_coarse
 from surrogates.training.loop import Diverged, Epoch, Keeper, device_of
 from surrogates.training.members import averaged, fits_together, trainer_of
 from surrogates.training.refinement import Refined
 from surrogates.training.trainer import Trainer
-from surrogates.uncertainty import FEWEST_BY_FOLDS, FEWEST_RUNS, Beliefs, calibrate_gathered, gather
+from surrogates.uncertainty import FEWEST_BY_FOLDS, FEWEST_RUNS, Band, Beliefs, calibrate_gathered, gather
 
 _log = logging.getLogger(__name__)
 
@@ -87,6 +88,7 @@ def train_surrogate(
     notes = Notes()
     check(campaign, settings, notes)
     check_targets(campaign, settings)
+    check_coarse(campaign, settings)
     of_pod = settings.model in ("pod-gpr", "pod-rbf")
     by_folds = of_pod or chooses_by_folds(settings, campaign)
     parts = everything(campaign, settings) if by_folds else split(campaign, settings, notes)
@@ -207,6 +209,8 @@ def _fit_regression(
     surrogate.core, surrogate.registration = found.core, found.registration
     record.choice = {"inputs": found.choice.inputs, "modes": found.choice.modes}
     record.physics = {**found.registration.told(), "errors": found.worth.errors}
+    if found.coarse is not None and campaign.coarse is not None:
+        note_coarse(record, campaign.coarse, found.coarse)
     _fit_curves(surrogate, campaign, trainer.settings, runs, wanted)
     _judge_by_folds(surrogate, trainer, found, watch)
     record.errors |= found.choice.errors
@@ -245,10 +249,39 @@ def _judge_by_folds(surrogate: Surrogate, trainer: Trainer, found: PodFit, watch
             f"there is no band: it takes {FEWEST_BY_FOLDS} training runs, and there are {len(set(places))}"
         )
         return
-    parameters = trainer.campaign.parameters[runs[places]]
+    campaign_parameters = trainer.campaign.parameters
+    parameters = campaign_parameters[runs[places]]
     sizes = found.registration.clock.size(parameters)
     beliefs = Beliefs(sizes, np.array(deviations), *surrogate.places(parameters))
     surrogate.bands[0, False] = calibrate_gathered(gathered, record.time, beliefs, np.array(places))
+    if found.itself is not None:
+        surrogate.run_band = _band_from_runs(surrogate, field, runs, found.itself(), campaign_parameters)
+
+
+def _band_from_runs(
+    surrogate: Surrogate,
+    field: LevelRuns,
+    runs: NDArray[np.int64],
+    held: Iterator[Held],
+    parameters: NDArray[np.float64],
+) -> Band | None:
+    """The band of predictions that start from a coarse run of the query; None where too few fine runs have one."""
+    places: list[int] = []
+    deviations: list[float] = []
+
+    def distances() -> Iterator[NDArray[np.float32]]:
+        for one in held:
+            places.append(one.run)
+            deviations.append(one.deviation)
+            yield _off(one.predicted, field, runs[one.run])
+
+    gathered = gather(distances())
+    if len(set(places)) < FEWEST_BY_FOLDS:
+        return None
+    of_runs = parameters[runs[places]]
+    sizes = surrogate.registration.clock.size(of_runs)
+    beliefs = Beliefs(sizes, np.array(deviations), *surrogate.places(of_runs))
+    return calibrate_gathered(gathered, surrogate.record.time, beliefs, np.array(places))
 
 
 def _fit_members(surrogate: Surrogate, trainer: Trainer) -> list[Member]:

@@ -1,0 +1,74 @@
+"""What runs on a coarser mesh add to a regression of fine ones.
+
+A prediction is w(x)' (F - s T C) + s c(x): the fine process's weights w of the fine courses F, and what the coarse field
+c at the query says beyond the coarse fields T C at the parameters of the fine runs, taken over with a slope s for each
+mode. c is a process over all coarse runs, or a coarse run of the query itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from surrogates.regression.gaussian import Gaussian
+
+
+@dataclass
+class CoarseBase:
+    """The coarse runs behind a model.
+
+    Attributes
+    ----------
+    process
+        Over the coarse runs and their images, with inputs scaled as those of the fine runs.
+    values
+        (coarse run and image, state of the grid, mode), m: registered courses times the slopes.
+    slopes
+        (mode,) how much of the coarse field is taken over.
+    to_fine
+        (node of the full mesh, coarse node): what a coarse field says at each node.
+    position, node_id
+        The coarse mesh (coarse node, 3), m, and the solver's numbers on it: a coarse run must have them.
+    share
+        How much a coarse run of the query counts; the process counts by the rest.
+    """
+
+    process: Gaussian
+    values: NDArray[np.float32]
+    slopes: NDArray[np.float64]
+    to_fine: sparse.csr_matrix
+    position: NDArray[np.float64]
+    node_id: NDArray[np.int64]
+    share: float = 1.0
+
+    def project(self, states: NDArray[np.float32], modes: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Coarse displacements (state, coarse node, 3), m -> what is taken over of their coefficients (state, mode)."""
+        return np.asarray((states.reshape(len(states), -1) @ coarse_modes(self.to_fine, modes)) * self.slopes)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """What has to be stored."""
+        u = self.to_fine
+        return {
+            "x": self.process.x, **self.process.numbers(), "values": self.values, "slopes": self.slopes,
+            "data": u.data, "indices": u.indices.astype(np.int32), "indptr": u.indptr.astype(np.int64),
+            "position": self.position, "node_id": self.node_id, "share": np.array([self.share]),
+        }  # fmt: skip
+
+    @classmethod
+    def load(cls, a: Mapping[str, NDArray[Any]]) -> CoarseBase:
+        """From what `arrays` gave."""
+        shape = (len(a["indptr"]) - 1, len(a["position"]))
+        to_fine = sparse.csr_matrix((a["data"], a["indices"], a["indptr"]), shape=shape)
+        process = Gaussian.load(a["x"], a)
+        return cls(process, a["values"], a["slopes"], to_fine, a["position"], a["node_id"], float(a["share"][0]))
+
+
+def coarse_modes(to_fine: sparse.csr_matrix, modes: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(3 * coarse node, mode): the modes (3 * node, mode) as coarse displacements see them, so that none is lifted."""
+    by_node = modes.reshape(to_fine.shape[0], -1)
+    return np.asarray((to_fine.T @ by_node).reshape(-1, modes.shape[1]), np.float32)

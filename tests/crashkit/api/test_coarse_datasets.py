@@ -1,0 +1,158 @@
+"""`train --coarse` and `predict --coarse-run`: two meshes of one structure matched, or refused in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from typer.testing import CliRunner
+
+import crashkit
+from crashkit.api.model import Model
+from crashkit.cli import app
+from crashkit.errors import DataError
+from surrogates.errors import SurrogateError
+
+TIME = np.linspace(0.0, 0.02, 6)
+OFF = {"physics": {"clock": "off", "symmetry": "off"}, "inputs": {"derived": "off"}, "pod": {"modes": [12]}}
+
+
+def dataset(side: int, runs: range, **changes: object) -> xr.Dataset:
+    """A box's lid and floor, `side` nodes along an edge, that dent the more the faster they are hit; runs of a fixed table."""
+    axis = np.linspace(0, 1, side)
+    x, y = (a.ravel() for a in np.meshgrid(axis, axis, indexing="ij"))
+    number = np.arange(side * side).reshape(side, side)
+    faces = np.stack([number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]], axis=-1).reshape(-1, 4)
+    table = np.random.default_rng(1).uniform([8, 1], [16, 3], (200, 2))[list(runs)]
+    speed, thickness = table.T[:, :, None, None]
+    at = np.concatenate([np.stack([x, y, np.full(side**2, z)], axis=1) for z in (0.0, 0.1)])
+    dent = np.exp(-6 * ((at[:, 0] - 0.5) ** 2 + (at[:, 1] - 0.5) ** 2)) * np.where(at[:, 2] > 0, 1.0, 0.4)
+    wave = 1 + 0.8 * np.sin(3 * thickness)
+    depth = 0.3 * speed * TIME[:, None] * wave * dent * (0.9 if side < 7 else 1.0)
+    u = np.stack([0.1 * depth, np.zeros_like(depth), -depth], axis=-1)
+    given: dict[str, object] = {
+        "names": [f"run_{k:02d}" for k in runs],
+        "face_part": np.repeat([0, 1], len(faces)),
+        "part_id": [7, 9],
+        "part_names": ["floor", "lid"],
+    }
+    parameters = changes.pop("parameters", {"speed (m/s)": speed.ravel(), "thickness (mm)": thickness.ravel()})
+    moved = np.asarray(changes.pop("moved", 0.0))
+    every = changes.pop("time", TIME)
+    return crashkit.from_arrays(
+        u, every, parameters, at + moved, np.concatenate([faces, faces + side**2]), **{**given, **changes}  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def coarse() -> xr.Dataset:
+    return dataset(5, range(60))
+
+
+@pytest.fixture(scope="module")
+def model(coarse: xr.Dataset) -> Model:
+    return crashkit.train(dataset(9, range(12)), model="pod-gpr", settings=OFF, test="10:", coarse=coarse)
+
+
+def trained_with(coarse: xr.Dataset) -> Model:
+    return crashkit.train(dataset(9, range(6)), model="pod-gpr", settings=OFF, coarse=coarse)
+
+
+def at(run: int) -> dict[str, float]:
+    one = dataset(5, range(run, run + 1))
+    return {name: float(one[name][0]) for name in ("speed", "thickness")}
+
+
+def test_coarse_runs_are_used_without_those_of_test_runs(model: Model) -> None:
+    assert model.record.coarse["runs"] == 58
+    assert model.record.coarse["twins"] == 10
+    assert model.record.coarse["way"] != "fine runs alone"
+
+
+def test_parts_are_matched_by_number_where_names_differ(coarse: xr.Dataset) -> None:
+    renamed = coarse.assign(part_name=("part", np.array(["a", "b"])))
+    assert trained_with(renamed).record.coarse["runs"] == 60
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"part_names": ["floor", "roof"], "part_id": [7, 8]}, "has no part lid"),
+        ({"moved": [0.0, 0.0, 4.0]}, "another mesh of the same structure"),
+        ({"parameters": {"speed (m/s)": np.arange(9.0)}}, "has no parameter thickness"),
+        ({"parameters": {"speed (m/s)": np.arange(9.0), "thickness (s)": np.arange(9.0)}}, "thickness is in s"),
+        ({"time": 0.5 * TIME}, "compute coarse runs as long"),
+    ],
+)
+def test_what_does_not_match_is_refused_in_one_line(changes: dict[str, object], said: str) -> None:
+    with pytest.raises(DataError, match=said) as refused:
+        trained_with(dataset(5, range(9), **changes))
+    assert "\n" not in str(refused.value)
+
+
+def test_other_models_refuse_coarse_runs_before_they_are_read() -> None:
+    with pytest.raises(SurrogateError, match="beneath pod-gpr"):
+        crashkit.train(dataset(9, range(6)), model="pod-rbf", coarse="no_such.zarr")
+
+
+def test_a_prediction_starts_from_a_run_of_a_dataset(model: Model, tmp_path: Path) -> None:
+    stored = tmp_path / "coarse.zarr"
+    dataset(5, range(70, 73), output=stored)
+    said = model.predict(at(71), coarse_run=f"{stored}:run_71", band=0.9)
+    true = dataset(9, range(71, 72))["displacement"].values[0]
+    alone = model.predict(at(71))["displacement"].values
+    error = np.linalg.norm(said["displacement"].values - true, axis=-1).mean()
+    assert error < np.linalg.norm(alone - true, axis=-1).mean()
+    assert (said["half_width"].values >= 0).all()
+
+
+def test_nodes_of_the_run_are_matched_by_number(model: Model) -> None:
+    run = dataset(5, range(71, 72))
+    turned = run.isel(node=slice(None, None, -1))
+    one, other = (model.predict(at(71), coarse_run=r)["displacement"].values for r in (run, turned))
+    np.testing.assert_allclose(one, other, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("run", "said"),
+    [
+        (dataset(6, range(71, 72)), "a node lies"),
+        (dataset(4, range(71, 72)), "and not node 33"),
+        (dataset(5, range(71, 72), moved=[0.0, 0.0, 0.01]), "a node lies 10 mm from its place"),
+        (dataset(5, range(72, 73)), "was computed with speed"),
+        (dataset(5, range(71, 73)), "holds 2 runs"),
+    ],
+)
+def test_a_run_of_another_mesh_or_of_other_parameters_is_refused(model: Model, run: xr.Dataset, said: str) -> None:
+    with pytest.raises(DataError, match=said):
+        model.predict(at(71), coarse_run=run)
+
+
+def test_a_model_of_fine_runs_alone_refuses_a_coarse_run() -> None:
+    plain = crashkit.train(dataset(9, range(6)), model="pod-gpr", settings=OFF)
+    with pytest.raises(DataError, match="train pod-gpr with --coarse"):
+        plain.predict(at(71), coarse_run=dataset(5, range(71, 72)))
+
+
+def test_the_commands(coarse: xr.Dataset, tmp_path: Path) -> None:
+    below, fine = tmp_path / "coarse.zarr", tmp_path / "fine.zarr"
+    dataset(5, range(40), output=below)
+    dataset(9, range(10), output=fine)
+    off = [x for s in ("physics.clock=off", "physics.symmetry=off", "inputs.derived=off") for x in ("--set", s)]
+    trained = CliRunner().invoke(
+        app,
+        ["train", str(fine), "-o", str(tmp_path / "m"), "--model", "pod-gpr", "--coarse", str(below), *off],
+    )
+    assert trained.exit_code == 0, trained.output
+    assert "coarse runs: 40 runs of coarse.zarr" in " ".join(trained.output.split())
+    below.rename(tmp_path / "elsewhere.zarr")
+    said = CliRunner().invoke(
+        app,
+        ["predict", str(tmp_path / "m"), "--coarse-run", f"{tmp_path / 'elsewhere.zarr'}:run_20", "-o", str(tmp_path / "p.npz")],
+    )  # fmt: skip
+    assert said.exit_code == 0, said.output
+    true = dataset(9, range(20, 21))["displacement"].values[0]
+    found = np.load(tmp_path / "p.npz")["displacement"]
+    assert np.linalg.norm(found - true, axis=-1).mean() < 0.1 * np.linalg.norm(true, axis=-1).mean()
