@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from surrogates.data.campaign import Campaign
 from surrogates.models.cascade import Cascade
+from surrogates.models.level import LevelNetwork
 from surrogates.physics.choice import Worth
 from surrogates.physics.clock import Clock
 from surrogates.physics.derived import DerivedInputs
@@ -21,9 +22,10 @@ from surrogates.physics.symmetry import Symmetry
 from surrogates.record import Fit
 from surrogates.settings import settings
 from surrogates.surrogate import Surrogate
-from surrogates.training import train
+from surrogates.training import by_folds, train
 from surrogates.training.by_folds import FoldTrainer, chooses_by_folds
 from surrogates.training.loop import Objective
+from surrogates.training.objectives import LevelObjective
 from surrogates.uncertainty import FEWEST_BY_FOLDS
 
 RUNS = 7
@@ -159,6 +161,22 @@ def test_a_reduction_is_trained_anew_on_all_runs_for_the_epochs_that_were_good_f
     assert trainer.asked == [("MH2 reduction", 9, 0.5), *again, ("MH2", 9, 0.5)]
     assert trainer.chosen[2].reduction_epochs == (7 if again else 0)
     assert ("reduction 7 epochs" if again else "reduction as computed") in surrogate.record.choice["MH2"]
+
+
+@pytest.mark.parametrize(("lost", "tried"), [(1.9, False), (2.1, True)])
+def test_a_reduction_is_not_tried_where_half_of_what_its_start_loses_does_not_matter(  # type: ignore[no-untyped-def]
+    trained, monkeypatch: pytest.MonkeyPatch, lost: float, tried: bool
+) -> None:
+    """`lost`: what the start at POD loses on left-out runs, in units of what matters."""
+
+    class Slight(Told):
+        def _wrong(self, level: LevelNetwork, *_: Any) -> float:
+            return level.scale**2 / by_folds._MATTERS
+
+    Slight.said = Fit(best_epoch=7, best=0.0)
+    monkeypatch.setattr(LevelObjective, "validation", lambda self: torch.tensor([lost, lost]))
+    _, trainer = trained(*(o.replace("start=plain", "start=pod") for o in PLAIN), trainer=Slight)
+    assert ("MH2 reduction" in [name for name, *_ in trainer.asked]) is tried
 
 
 def test_a_reduction_whose_training_is_interrupted_gets_a_process_and_no_network(trained) -> None:  # type: ignore[no-untyped-def]
