@@ -79,9 +79,7 @@ def explore(
     browser, largest = [], 0.0
     for k, (folder, surrogate) in enumerate(zip(folders, loaded, strict=True)):
         found = browsable(surrogate, folder.resolve().name, f"m{k}_", share)
-        browser.append(
-            BrowserModel({**found.about, "parameters": _parameters(surrogate)}, found.arrays, found.quantised)
-        )
+        browser.append(BrowserModel({**found.about, "parameters": _parameters(surrogate)}, found.arrays, found.steps))
         largest = max(largest, _largest(surrogate))
     mesh = ExplorerMesh(np.asarray(first.points, np.float64), first.faces)
     runs = len(first.record.fitted_runs)

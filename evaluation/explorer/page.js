@@ -8,7 +8,7 @@
   const mesh = bundle.mesh;
   const reference = arrays[mesh.reference], faces = arrays[mesh.faces];
   const models = bundle.models.map((spec) => makeModel(spec, arrays, mesh));
-  let model = models[0], held = null, picked = [], playing = null, colour = 'displacement', now = null, waiting = false;
+  let model = models[0], held = null, picked = [], playing = null, colour = 'displacement', now = null, waiting = false, drawnCurves = {};
   const state = {parameters: {}, time: 0};
 
   // For programs: displacements, m, xyz node by node; parameters in the dataset's units, time in s, level 0: the full mesh.
@@ -120,7 +120,7 @@
   }
 
   function drawn() {
-    const lengths = (u) => { const out = new Float32Array(mesh.nodes); for (let n = 0; n < mesh.nodes; n++) out[n] = Math.hypot(u[3 * n], u[3 * n + 1], u[3 * n + 2]); return out; };
+    const lengths = (u) => { const out = new Float32Array(mesh.nodes); for (let n = 0; n < mesh.nodes; n++) out[n] = length(u, n); return out; };
     const {u, other, band} = now;
     let value = lengths(u), second = other && lengths(other), top = Math.max(bundle.largest, 1e-9);
     if (colour === 'band' && band) { value = band; second = other && held.model.band(held.parameters, state.time, held.level) || second; top = Math.max(...band, 1e-9); }
@@ -148,7 +148,7 @@
     const nodes = part < 0 ? null : arrays[mesh.parts[part].nodes];
     const most = (u) => {
       let best = 0, at = 0;
-      const look = (n) => { const v = axis === 3 ? Math.hypot(u[3 * n], u[3 * n + 1], u[3 * n + 2]) : Math.abs(u[3 * n + axis]); if (v > best) { best = v; at = n; } };
+      const look = (n) => { const v = axis === 3 ? length(u, n) : Math.abs(u[3 * n + axis]); if (v > best) { best = v; at = n; } };
       if (nodes) nodes.forEach(look); else for (let n = 0; n < mesh.nodes; n++) look(n);
       return [best, at];
     };
@@ -166,9 +166,15 @@
     get('picked').textContent = picked.length ? `nodes ${picked.map((n) => mesh.node_id ? arrays[mesh.node_id][n] : n).join(', ')}` : 'Tap a node of the structure.';
     if (!picked.length) return;
     const times = Array.from({length: 25}, (_, k) => first + (last - first) * k / 24), hues = ['#1c6dd0', '#c2410c', '#15803d', '#7e22ce'];
-    const course = (m, parameters, number) => times.map((t) => { const u = m.full(parameters, t, number); return picked.map((n) => Math.hypot(u[3 * n], u[3 * n + 1], u[3 * n + 2])); });
-    const mine = course(model, state.parameters, level()), theirs = held && course(held.model, held.parameters, held.level);
-    const bands = times.map((t) => model.band(state.parameters, t, level()));
+    const course = (m, parameters, number) => times.map((t) => { const u = m.full(parameters, t, number); return picked.map((n) => length(u, n)); });
+    const key = JSON.stringify([models.indexOf(model), state.parameters, level(), picked, held && [models.indexOf(held.model), held.parameters, held.level]]);
+    if (drawnCurves.key !== key) {  // while the time alone moves, the curves stay
+      drawnCurves = {
+        key, mine: course(model, state.parameters, level()), theirs: held && course(held.model, held.parameters, held.level),
+        bands: times.map((t) => model.band(state.parameters, t, level())),
+      };
+    }
+    const {mine, theirs, bands} = drawnCurves;
     const top = Math.max(...mine.flat(), ...(theirs ? theirs.flat() : []), 1e-9) * 1.05, x = (t) => 40 + (w - 46) * (t - first) / (last - first || 1), y = (v) => h - 18 - (h - 26) * v / top;
     pen.font = '11px system-ui'; pen.fillStyle = '#616e7c'; pen.strokeStyle = '#d9e2ec';
     pen.fillText(`${show(1e3 * top)} mm`, 0, 12); pen.fillText('0', 28, h - 16); pen.fillText(`${show(1e3 * last)} ms`, w - 42, h - 4);
@@ -189,23 +195,34 @@
     pen.strokeStyle = '#1f2933'; pen.beginPath(); pen.moveTo(x(state.time), 8); pen.lineTo(x(state.time), h - 18); pen.stroke();
   }
 
+  function length(u, n) { const x = u[3 * n], y = u[3 * n + 1], z = u[3 * n + 2]; return Math.sqrt(x * x + y * y + z * z); }
   function options(select, pairs) {
     select.replaceChildren(...pairs.map(([value, text]) => { const o = document.createElement('option'); o.value = String(value); o.textContent = text; return o; }));
   }
   function show(v) { return Number(v.toPrecision(3)).toString(); }
 })().catch((error) => { document.body.prepend(`This page could not be started: ${error.message}`); throw error; });
 
-// Arrays are kept as base64 of little-endian numbers, gzipped; quantised ones as whole numbers with a step for each column.
+// Arrays are kept as base64 of the byte planes of little-endian numbers, gzipped; rounded ones column by column, as whole
+// multiples of a step, 0, 1, 2, 3, .. for 0, -1, 1, -2, ..
 async function unpack(stored) {
+  if (typeof DecompressionStream === 'undefined') throw new Error('this browser is too old to unpack it (it lacks DecompressionStream, which all have since May 2023); open it in a newer one');
   const kinds = {f4: Float32Array, f8: Float64Array, i4: Int32Array, u4: Uint32Array, u2: Uint16Array, i2: Int16Array};
   const out = {};
   for (const [name, a] of Object.entries(stored)) {
     const raw = Uint8Array.from(atob(a.data), (c) => c.charCodeAt(0));
     const bytes = new Uint8Array(await new Response(new Blob([raw]).stream().pipeThrough(new DecompressionStream('gzip'))).arrayBuffer());
+    if (a.steps) {
+      const columns = a.columns, count = bytes.length / 4, rows = count / columns, values = new kinds[a.kind](count);
+      for (let k = 0, i = 0; k < columns; k++) for (let row = 0; row < rows; row++, i++) {
+        const u = bytes[i] + 256 * (bytes[count + i] + 256 * (bytes[2 * count + i] + 256 * bytes[3 * count + i]));
+        values[row * columns + k] = a.steps[k % a.steps.length] * (u % 2 ? -(u + 1) / 2 : u / 2);
+      }
+      out[name] = values;
+      continue;
+    }
     const plain = new Uint8Array(bytes.length), size = kinds[a.kind].BYTES_PER_ELEMENT, count = bytes.length / size;
     for (let b = 0; b < size; b++) for (let i = 0; i < count; i++) plain[i * size + b] = bytes[b * count + i];
-    const values = new kinds[a.kind](plain.buffer);
-    out[name] = a.steps ? Float32Array.from(values, (v, i) => v * a.steps[i % a.steps.length]) : values;
+    out[name] = new kinds[a.kind](plain.buffer);
   }
   return out;
 }

@@ -31,12 +31,15 @@ class BrowserModel:
         Plain values: name, kind ("process" or "cascade"), parameters, levels, registration and so on, as `model.js` reads
         them; where it says the name of an array, that one of `arrays` is meant.
     arrays
-        Numbers by name. Those named in `quantised` may be rounded to whole steps, 32767 for the largest of each column.
+        Numbers by name.
+    steps
+        For arrays (row, column) that may be rounded: to multiples of what, for each column or for a group of columns
+        that comes again and again.
     """
 
     about: Mapping[str, Any]
     arrays: Mapping[str, NDArray[Any]]
-    quantised: frozenset[str] = frozenset()
+    steps: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -91,13 +94,10 @@ def explorer_page(
     for k, (name, nodes) in enumerate(mesh.parts.items()):
         arrays[f"mesh_part_{k}"] = nodes.astype(np.uint32)
         parts.append({"name": name, "nodes": f"mesh_part_{k}"})
-    steps: dict[str, list[float]] = {}
+    steps: dict[str, NDArray[np.float64]] = {}
     for model in models:
-        for name, values in model.arrays.items():
-            if name in model.quantised:
-                arrays[name], steps[name] = quantised(values)
-            else:
-                arrays[name] = values
+        arrays |= model.arrays
+        steps |= model.steps
     bundle = {
         "about": about, "largest": largest, "axis": axis, "share": share,
         "models": [m.about for m in models],
@@ -126,22 +126,34 @@ def triangles(faces: NDArray[np.int32]) -> NDArray[np.int32]:
     return np.concatenate([faces[:, :3], quads[:, [0, 2, 3]]])
 
 
-def quantised(values: NDArray[Any]) -> tuple[NDArray[np.int16], list[float]]:
-    """Whole numbers for each column of (row, column), and the step of each column."""
-    largest = np.abs(values).max(axis=0)
-    step = np.where(largest > 0, largest / 32767, 1.0)
-    return np.round(values / step).astype(np.int16).ravel(), [float(s) for s in step]
+def packed(values: NDArray[Any], steps: NDArray[np.float64] | None = None) -> dict[str, Any]:
+    """An array as the page unpacks it: byte planes, gzipped, base64.
 
-
-def packed(values: NDArray[Any], steps: list[float] | None = None) -> dict[str, Any]:
-    """An array as the page unpacks it: byte planes, gzipped, base64."""
-    kind = {"f4": "<f4", "f8": "<f8", "i4": "<i4", "u4": "<u4", "i2": "<i2", "i8": "<i4"}[values.dtype.str[1:]]
-    raw = np.ascontiguousarray(values.ravel().astype(kind))
+    With `steps` for `values` (row, column), see `BrowserModel`: column by column, whole multiples of the steps. What is rounded to
+    a step far above its last bit has upper bytes that are zero, which cost nothing.
+    """
+    whole = None if steps is None else rounded(values, steps)
+    kind = {"f4": "<f4", "f8": "<f8", "i4": "<i4", "u4": "<u4", "i8": "<i8"}[values.dtype.str[1:]]
+    raw = np.ascontiguousarray(values.ravel().astype(kind)) if whole is None else whole
     planes = raw.view(np.uint8).reshape(-1, raw.dtype.itemsize).T.tobytes()
     out: dict[str, Any] = {
         "kind": kind[1:],
         "data": base64.b64encode(gzip.compress(planes, 9, mtime=0)).decode("ascii"),
     }
-    if steps is not None:
-        out["steps"] = steps
+    if whole is not None and steps is not None:
+        out["steps"], out["columns"] = _told(steps), values.shape[1]
     return out
+
+
+def rounded(values: NDArray[Any], steps: NDArray[np.float64]) -> NDArray[np.uint32] | None:
+    """(column * row,) multiples of the steps: 0, -1, 1, -2, .. as 0, 1, 2, 3, ..; None where they have more than 31 bits."""
+    whole = np.rint(values / np.resize(_told(steps), values.shape[1]))
+    if not np.abs(whole).max(initial=0) < 2**30:
+        return None
+    signed = whole.T.astype(np.int64).ravel()
+    return np.asarray(np.where(signed < 0, -2 * signed - 1, 2 * signed), np.uint32)
+
+
+def _told(steps: NDArray[np.float64]) -> list[float]:
+    """As many digits as are written into the page."""
+    return [float(f"{step:.9g}") for step in steps]

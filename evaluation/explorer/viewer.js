@@ -23,7 +23,8 @@ function makeViewer(canvas, faces, reference) {
       colour = vec4(texture(table, vec2(shade, 0.5)).rgb * light, 1.0);
     }`;
   const program = link(gl, vertex, fragment);
-  const at = (name) => gl.getUniformLocation(program, name);
+  const [uniforms, attributes] = [new Map(), new Map()];  // asking the driver for a place waits for it
+  const at = (name) => remembered(uniforms, name, () => gl.getUniformLocation(program, name));
   const places = gl.createBuffer(), values = gl.createBuffer(), triangles = gl.createBuffer();
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, triangles);
   gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
@@ -67,7 +68,7 @@ function makeViewer(canvas, faces, reference) {
   }
 
   function attribute(buffer, data, name, size) {
-    const location = gl.getAttribLocation(program, name);
+    const location = remembered(attributes, name, () => gl.getAttribLocation(program, name));
     gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
     gl.bufferData(gl.ARRAY_BUFFER, data, gl.DYNAMIC_DRAW);
     gl.enableVertexAttribArray(location);
@@ -139,6 +140,11 @@ function makeViewer(canvas, faces, reference) {
   }
   function reset() { Object.assign(view, {centre: box.centre.slice(), zoom: 1, distance: 1, yaw: -0.9, pitch: 0.5}); }
   return {draw, pick, handle, reset};
+}
+
+function remembered(known, name, find) {
+  if (!known.has(name)) known.set(name, find());
+  return known.get(name);
 }
 
 function link(gl, vertex, fragment) {

@@ -66,7 +66,7 @@ class LatentProcess(nn.Module):
         place, parts = self._stencil(inputs[:, self.runs.shape[1]])
         parameters = inputs[:, : self.runs.shape[1]]
         one_run = _alike(parameters)
-        weights = self._kernel(parameters[:1] if one_run else parameters)
+        weights = self.weights(parameters[:1] if one_run else parameters)
         courses = self.mean + (weights @ self.pull.flatten(1)).unflatten(1, self.mean.shape)
         if one_run:
             courses = courses.expand(len(inputs), -1, -1)
@@ -76,8 +76,8 @@ class LatentProcess(nn.Module):
             out = out + part[:, None] * courses.gather(1, at[:, None, None].expand(-1, 1, out.shape[1])).squeeze(1)
         return out
 
-    def _kernel(self, x: Tensor) -> Tensor:
-        """(b, run): Matern 3/2 with a linear trend."""
+    def weights(self, x: Tensor) -> Tensor:
+        """(b, run) what courses are weighted with: Matern 3/2 with a linear trend."""
         apart = ((x[:, None] - self.runs) @ self.mix.T).square().sum(dim=2)
         distance = math.sqrt(3.0) * torch.sqrt(apart + 1e-12)
         matern = self.numbers[0] * (1.0 + distance) * torch.exp(-distance)

@@ -11,15 +11,18 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from surrogates.errors import SurrogateError
 from surrogates.local_errors import HARD, REACH, LocalErrors
 from surrogates.models.average import Average, some_states
+from surrogates.models.base import Network
 from surrogates.models.cascade import Cascade
 from surrogates.models.pod_regression import PodRegression
 from surrogates.regression.gaussian import Gaussian
-from surrogates.storage.steps import cascade_steps, side_by_side
+from surrogates.storage.steps import SHARE, cascade_steps, side_by_side
 from surrogates.surrogate import Surrogate
 
 
@@ -33,13 +36,14 @@ class Browsable:
         Plain values; names in it mean arrays.
     arrays
         Numbers by name.
-    quantised
-        Names of arrays (row, column) that may be rounded to 1/32767 of each column's largest value.
+    steps
+        For arrays (row, column) that may be rounded: to multiples of what, for each column or for a group of columns
+        that comes again and again.
     """
 
     about: dict[str, Any]
     arrays: dict[str, NDArray[Any]]
-    quantised: frozenset[str] = field(default_factory=frozenset)
+    steps: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
 
 def browsable(surrogate: Surrogate, name: str, prefix: str, share: float = 0.9) -> Browsable:
@@ -52,17 +56,18 @@ def browsable(surrogate: Surrogate, name: str, prefix: str, share: float = 0.9) 
     """
     core = surrogate.core
     arrays: dict[str, NDArray[Any]] = {}
-    quantised: set[str] = set()
+    steps: dict[str, NDArray[np.float64]] = {}
     about: dict[str, Any] = {
         "name": name, "time": surrogate.record.time.tolist(), "registration": _registration(surrogate),
         "levels": _levels(surrogate, arrays, prefix), "bands": _bands(surrogate, arrays, prefix, share), "hard": _hard(surrogate),
     }  # fmt: skip
     if isinstance(core, PodRegression):
-        about |= _process(core, arrays, quantised, prefix)
+        about |= _process(core, arrays, steps, prefix)
     elif isinstance(core, Cascade):
-        about |= cascade_steps([core], about["levels"], arrays, prefix)
+        about |= cascade_steps([core], about["levels"], arrays, prefix, steps, _known(surrogate, core))
     elif isinstance(core, Average) and all(isinstance(member, Cascade) for member in core.networks):
-        about |= cascade_steps(core.networks, about["levels"], arrays, prefix)  # type: ignore[arg-type]
+        known = _known(surrogate, core)
+        about |= cascade_steps(core.networks, about["levels"], arrays, prefix, steps, known)  # type: ignore[arg-type]
         places = some_states(len(surrogate.record.time))
         about["apart"] = {
             "level": max(core.numbers), "floor": core.floor, "time": surrogate.record.time[places].tolist(),
@@ -71,10 +76,26 @@ def browsable(surrogate: Surrogate, name: str, prefix: str, share: float = 0.9) 
         raise SurrogateError(
             f"{name}: unified levels have no form for a browser; use mh, podnn, aenn, gaenn or pod-gpr"
         )
-    return Browsable(about, arrays, frozenset(quantised))
+    return Browsable(about, arrays, steps)
 
 
-def _process(core: PodRegression, arrays: dict[str, NDArray[Any]], quantised: set[str], prefix: str) -> dict[str, Any]:
+def _known(surrogate: Surrogate, network: Network) -> Tensor | None:
+    """(sample, input): what the regressions read for training runs at some states; None where those are not kept."""
+    record, registration = surrogate.record, surrogate.registration
+    if any(name not in record.parameters for name in record.ranges.names):
+        return None
+    runs = registration.read(np.array([record.parameters[name] for name in record.ranges.names], np.float64).T)
+    grid = record.time if registration.is_identity else registration.grid
+    time = grid[some_states(len(grid))]
+    at = torch.from_numpy(np.repeat(runs, len(time), axis=0)), torch.from_numpy(np.tile(time, len(runs)))
+    with torch.no_grad():
+        known: Tensor = network.inputs(*at)
+    return known
+
+
+def _process(
+    core: PodRegression, arrays: dict[str, NDArray[Any]], steps: dict[str, NDArray[np.float64]], prefix: str
+) -> dict[str, Any]:
     if not isinstance(core.machine, Gaussian) or core.inputs != "trajectory":
         raise SurrogateError("only Gaussian processes over whole runs have a form for a browser; train pod-gpr or mh")
     if core.base is not None:
@@ -88,8 +109,13 @@ def _process(core: PodRegression, arrays: dict[str, NDArray[Any]], quantised: se
     }  # fmt: skip
     for key, values in named.items():
         arrays[prefix + key] = np.asarray(values, np.float32 if key == "modes" else np.float64)
-    quantised.add(f"{prefix}modes")
     kernel = core.machine.kernel
+    coefficients = np.abs(known.reshape(len(known), -1, core.modes.shape[1])).max(axis=(0, 1))
+    largest = np.abs(core.modes).max(axis=0)
+    allowed = SHARE * float((coefficients * largest).max())
+    steps[f"{prefix}modes"] = allowed / np.maximum(coefficients, 1e-30)
+    weights = np.linalg.norm(kernel(core.machine.x, core.machine.x), axis=1).max()
+    steps[f"{prefix}pull"] = allowed / np.maximum(largest * weights, 1e-30)
     return {
         "kind": "process", "arrays": {key: prefix + key for key in named},
         "kernel": {"variance": float(kernel.variance), "slope": float(kernel.slope), "noise": float(kernel.noise)},

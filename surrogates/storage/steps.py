@@ -23,24 +23,42 @@ from surrogates.operators.convolutions import ChebConv
 from surrogates.operators.stacks import GraphDecoder
 from surrogates.operators.upsampling import Upsampling
 from surrogates.reductions.reduction import DenseReduction, GraphReduction, LinearReduction, Reduction, SumReduction
-from surrogates.regression.latent_process import LatentProcess
 
 _ACTIVATIONS: Mapping[type[nn.Module], str] = {nn.ELU: "elu", nn.SiLU: "silu", nn.Tanh: "tanh", nn.GELU: "gelu"}
 
 
+# Share of the largest displacement by which a rounded column of modes may be wrong: many add up, and 1e-4 is promised.
+SHARE = 3e-6
+# Dense layers are rounded to this share of the largest weight of each column.
+_DENSE = 2.0**-19
+
+
 def cascade_steps(
-    members: Sequence[Cascade], levels: list[dict[str, Any]], arrays: dict[str, NDArray[Any]], prefix: str
-) -> dict[str, Any]:
+    members: Sequence[Cascade], levels: list[dict[str, Any]], arrays: dict[str, NDArray[Any]], prefix: str,
+    rounded: dict[str, NDArray[np.float64]], known: Tensor | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """Give each of `levels` (see `browser`) its `steps`, put numbers into `arrays`; the rest is returned.
 
-    The steps end in `out`, m, the mean of `outs`, one for each of the `members`.
+    The steps end in `out`, m, the mean of `outs`, one for each of the `members`. What does nothing is left out: an
+    untrained remainder, and networks beside a process that has the whole share.
+
+    Parameters
+    ----------
+    rounded
+        Filled with the steps to which columns of arrays may be rounded (`Browsable.steps`).
+    known
+        (sample, input) scaled inputs of training runs, which say how large latent numbers become; without them nothing
+        that depends on it is rounded.
 
     Raises
     ------
     SurrogateError
         For a part of the model that has no such form.
     """
-    writer = _Writer(arrays, prefix)
+    writer = _Writer(arrays, prefix, rounded)
+    if known is not None:
+        for cascade in members:
+            writer.measure(cascade, known)
     for told in levels:
         writer.steps = []
         outs = []
@@ -64,22 +82,28 @@ def cascade_steps(
 class _Writer:
     """Collects steps; equal tensors, which several levels or trainings use, are kept once."""
 
-    def __init__(self, arrays: dict[str, NDArray[Any]], prefix: str) -> None:
-        self.arrays, self.prefix = arrays, prefix
+    def __init__(self, arrays: dict[str, NDArray[Any]], prefix: str, rounded: dict[str, NDArray[np.float64]]) -> None:
+        self.arrays, self.prefix, self.rounded = arrays, prefix, rounded
+        self._columns: dict[int, NDArray[np.float64]] = {}
+        self._latent: dict[int, NDArray[np.float64]] = {}
         self.steps: list[dict[str, Any]] = []
         self._kept: dict[tuple[bytes, str], str] = {}
         self._count = 0
 
-    def array(self, tensor: Tensor, dtype: Any = np.float32) -> str:
-        """The name under which `tensor` is kept, row by row."""
-        return self.numbers(np.ascontiguousarray(tensor.detach().cpu().numpy().astype(dtype)).ravel())
+    def array(self, tensor: Tensor, dtype: Any = np.float32, steps: NDArray[np.float64] | None = None) -> str:
+        """The name under which `tensor` is kept, row by row; `steps` it may be rounded to, see `Browsable`."""
+        values = np.ascontiguousarray(tensor.detach().cpu().numpy().astype(dtype))
+        name = self.numbers(values)
+        if steps is not None:
+            self.rounded[name] = np.minimum(steps, self.rounded.get(name, np.inf))
+        return name
 
     def numbers(self, values: NDArray[Any]) -> str:
         """The name under which `values` are kept."""
         key = (hashlib.sha256(values.tobytes()).digest(), values.dtype.str)
         if key not in self._kept:
             self._kept[key] = f"{self.prefix}t{len(self._kept)}"
-            self.arrays[self._kept[key]] = values
+            self.arrays[self._kept[key]] = values if values.ndim == 2 else values.ravel()
         return self._kept[key]
 
     def add(self, step: str, out: str = "", **values: Any) -> str:
@@ -89,12 +113,36 @@ class _Writer:
         self.steps.append({"step": step, "out": out, **values})
         return out
 
+    @torch.no_grad()
+    def measure(self, cascade: Cascade, known: Tensor) -> None:
+        """Find out to what modes and latent numbers of `cascade` may be rounded, from inputs (sample, input) that occur."""
+        for level in cascade.levels.values():
+            if level.with_initial:
+                return
+            reach = level.regress(known).abs().amax(dim=0).double().numpy()
+            parts = _linear_parts(level)
+            if parts is None:
+                continue
+            sizes = np.zeros(level.latent)
+            for factor, matrix in parts:
+                columns = factor * matrix.abs().amax(dim=0).double().numpy()
+                sizes[: len(columns)] = np.maximum(sizes[: len(columns)], columns)
+            allowed = SHARE * float((sizes * reach).max())
+            for factor, matrix in parts:
+                some = reach[: matrix.shape[1]]
+                step = allowed / np.maximum(factor * some, 1e-30)
+                key = id(matrix)
+                self._columns[key] = np.minimum(step, self._columns.get(key, np.full(len(step), np.inf)))
+            self._latent[id(level)] = allowed / np.maximum(sizes, 1e-30)
+
     # ------------------------------------------------------------------------------------------ regression
 
     def regress(self, level: LevelNetwork) -> str:
         """z of `level` from the scaled inputs."""
         if level.with_initial:
             raise SurrogateError("inputs.initial_state has no form for a browser; train without it")
+        if level.process is not None and float(level.process.share) == 1:
+            return self.process(level)
         below = None if level.coarse is None else self.regress(level.coarse)
         read = "inputs" if below is None else self.add("concat", of=["inputs", below])
         z = self.team(level.regressor.network, read)
@@ -107,7 +155,7 @@ class _Writer:
         if below is not None and level.regressor.residual:
             z = self.add("sum", of=[z, below])
         if level.process is not None:
-            z = self.add("mix", of=[z, self.process(level.process)], share=float(level.process.share))
+            z = self.add("mix", of=[z, self.process(level)], share=float(level.process.share))
         return z
 
     def team(self, network: nn.Module, of: str) -> str:
@@ -139,18 +187,26 @@ class _Writer:
         return of
 
     def linear(self, layer: nn.Linear, of: str) -> str:
-        return self.add("linear", of=of, weight=self.array(layer.weight), bias=self.array(layer.bias))
+        largest = layer.weight.abs().amax(dim=0).double().numpy()
+        weight = self.array(layer.weight, steps=_DENSE * np.maximum(largest, 1e-30))
+        return self.add("linear", of=of, weight=weight, bias=self.array(layer.bias))
 
     def activation(self, layer: nn.Module) -> str:
         if type(layer) not in _ACTIVATIONS:
             raise SurrogateError(f"activation {type(layer).__name__} has no form for a browser")
         return _ACTIVATIONS[type(layer)]
 
-    def process(self, process: LatentProcess) -> str:
+    def process(self, level: LevelNetwork) -> str:
+        process = level.process
+        assert process is not None
+        steps = self._latent.get(id(level))
+        if steps is not None:
+            weights = process.weights(process.runs).norm(dim=1).max()
+            steps = steps / float(weights)
         return self.add(
             "kernel", of="inputs", runs=self.array(process.runs, dtype=np.float64), mix=self.array(process.mix, dtype=np.float64),
             numbers=[float(v) for v in process.numbers], time=self.array(process.time, dtype=np.float64),
-            mean=self.array(process.mean, dtype=np.float64), pull=self.array(process.pull, dtype=np.float64),
+            mean=self.array(process.mean, dtype=np.float64), pull=self.array(process.pull.flatten(1), np.float64, steps),
             parameters=process.runs.shape[1], samples=process.runs.shape[0],
         )  # fmt: skip
 
@@ -181,11 +237,14 @@ class _Writer:
 
     def reduction(self, reduction: Reduction, z: str) -> str:
         if isinstance(reduction, SumReduction):
+            if gives_zero(reduction.remainder):
+                return self.reduction(reduction.linear, z)
             return self.add("sum", of=[self.reduction(reduction.linear, z), self.reduction(reduction.remainder, z)])
         if isinstance(reduction, LinearReduction):
             return self.add(
-                "linear", of=z, weight=self.array(reduction.decode_matrix), bias=self.array(reduction.offset)
-            )
+                "linear", of=z, bias=self.array(reduction.offset),
+                weight=self.array(reduction.decode_matrix, steps=self._columns.get(id(reduction.decode_matrix))),
+            )  # fmt: skip
         if isinstance(reduction, DenseReduction):
             return self.dense(reduction.decoder, z)
         if isinstance(reduction, GraphReduction):
@@ -225,6 +284,29 @@ class _Writer:
             names = [self.array(upsampling.columns, dtype=np.uint32), self.array(upsampling.weight)]
         bias = None if upsampling.kind == "static" else self.array(upsampling.bias)
         return self.add("gather", of=of, columns=names[0], weights=names[1], bias=bias, nodes=upsampling.shape[0])
+
+
+def gives_zero(reduction: Reduction) -> bool:
+    """Whether it decodes everything as zero, as one beside a linear part does until it is trained."""
+    if isinstance(reduction, GraphReduction):
+        last: Any = reduction.decoder.convolutions.layers[-1]
+    elif isinstance(reduction, DenseReduction):
+        last = [layer for layer in reduction.decoder.children() if isinstance(layer, nn.Linear)][-1]
+    else:
+        return False
+    return not any(bool(values.any()) for values in last.parameters())
+
+
+def _linear_parts(level: LevelNetwork) -> list[tuple[float, Tensor]] | None:
+    """Decoding matrices of a level and of those below it, each with its unit against the level's; None for another kind."""
+    linear = level.reduction.linear if isinstance(level.reduction, SumReduction) else level.reduction
+    if not isinstance(linear, LinearReduction):
+        return None
+    out = [(1.0, linear.decode_matrix)]
+    if level.coarse is None:
+        return out  # type: ignore[return-value]
+    below = _linear_parts(level.coarse)
+    return None if below is None else [*out, *((factor * level.ratio, matrix) for factor, matrix in below)]
 
 
 def side_by_side(matrix: Any) -> tuple[NDArray[np.uint32], NDArray[np.float32]]:

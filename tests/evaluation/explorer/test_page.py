@@ -17,7 +17,7 @@ import pytest
 from crashkit.api.explore import explore
 from crashkit.errors import DataError, OutputError
 from evaluation.errors import EvaluationError
-from evaluation.explorer.page import BrowserModel, ExplorerMesh, explorer_page, packed, quantised, triangles
+from evaluation.explorer.page import BrowserModel, ExplorerMesh, explorer_page, packed, rounded, triangles
 from surrogates.errors import SurrogateError
 from surrogates.settings import settings
 from surrogates.storage.browser import browsable
@@ -226,12 +226,33 @@ def test_models_with_other_parameters_do_not_share_a_page() -> None:
         explorer_page("x", two, mesh)
 
 
+def unzigzag(whole: np.ndarray, rows: int) -> np.ndarray:
+    odd = whole % 2 == 1
+    return np.where(odd, -(whole.astype(np.int64) + 1) // 2, whole.astype(np.int64) // 2).reshape(-1, rows).T
+
+
 def test_rounded_columns_are_off_by_at_most_half_a_step() -> None:
-    values = np.random.default_rng(0).normal(size=(50, 3)) * [1e-6, 1.0, 1e6]
-    whole, steps = quantised(values)
-    back = whole.reshape(50, 3) * np.array(steps)
-    assert (np.abs(back - values) <= 0.5000001 * np.array(steps)).all()
-    assert packed(whole, steps)["kind"] == "i2"
+    values = np.random.default_rng(0).normal(size=(50, 6)) * [1e-6, 1.0, 1e6, 1e-6, 1.0, 1e6]
+    steps = np.array([1e-9, 1e-2, 1e2])
+    whole = rounded(values, steps)
+    assert whole is not None
+    back = unzigzag(whole, 50) * np.tile(steps, 2)
+    assert (np.abs(back - values) <= 0.5000001 * np.tile(steps, 2)).all()
+    assert np.abs(back - values).max() > 0
+    told = packed(values, steps)
+    assert (told["columns"], len(told["steps"])) == (6, 3)
+
+
+def test_what_is_rounded_coarsely_takes_less() -> None:
+    values = np.random.default_rng(0).normal(size=(500, 4))
+    sizes = [len(packed(values, np.full(4, step))["data"]) for step in (1e-6, 1e-3, 1e-1)]
+    assert sizes[0] > 1.5 * sizes[1] > 2 * sizes[2]
+
+
+def test_what_has_too_many_bits_stays_as_it_is() -> None:
+    told = packed(np.array([[1.0, 2.0]]), np.array([1e-12]))
+    assert told["kind"] == "f8"
+    assert "steps" not in told
 
 
 def test_quadrilaterals_become_two_triangles() -> None:

@@ -47,8 +47,8 @@ def test_at_trained_times_it_is_the_gaussian_process_of_whole_courses() -> None:
 
 def test_one_run_costs_one_course_and_gives_what_any_batch_gives(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
-    kernel = LatentProcess._kernel
-    monkeypatch.setattr(LatentProcess, "_kernel", lambda self, x: asked.append(len(x)) or kernel(self, x))
+    kernel = LatentProcess.weights
+    monkeypatch.setattr(LatentProcess, "weights", lambda self, x: asked.append(len(x)) or kernel(self, x))
     query = at(np.repeat([[0.3, -0.2]], 5, axis=0), TIME)
     other = at(np.array([[0.5, 0.5]]), TIME[:1])
     process = fitted()
@@ -171,7 +171,7 @@ def test_room_is_made_for_what_was_stored() -> None:
     assert (len(again.runs), again.mean.shape, again.mix.shape) == (12, (5, 3), (2, 2))
 
 
-def test_latent_numbers_that_move_nothing_have_no_say_in_the_kernel() -> None:
+def test_latent_numbers_that_move_nothing_have_no_say_in_theweights() -> None:
     """Noise in a number of size 0 changes the kernel's numbers for no other."""
     noisy = courses()
     noisy[..., 2] = np.random.default_rng(5).normal(size=noisy.shape[:2])
