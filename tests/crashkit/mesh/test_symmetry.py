@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from crashkit.mesh import symmetry
+from crashkit.mesh.surface import Surface
 from crashkit.mesh.symmetry import mirror_plane, mirror_planes
 from data_schema.mirror import MirrorPlane
 
@@ -73,6 +76,29 @@ def test_a_shape_without_symmetry_has_no_plane() -> None:
     points, quads, part = box()
     points[:, 2] += 0.4 * points[:, 0] * points[:, 1] + 0.3 * np.sin(3 * points[:, 1]) + 0.2 * points[:, 0] ** 2
     assert mirror_planes(points, quads, part) == []
+
+
+@pytest.mark.parametrize("bent", [0.0, 0.4])
+def test_some_nodes_of_a_large_mesh_only_spare_planes_that_do_not_fit(
+    bent: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points, quads, part = box(12, jitter=0.01)
+    points[:, 2] += bent * np.maximum(points[:, 1] - 0.5, 0.0)
+    judged: list[NDArray[np.float64]] = []
+    of_all = symmetry._plane
+
+    def counted(mesh: Surface, normal: NDArray[np.float64], offset: float, edge: float) -> MirrorPlane:
+        judged.append(normal)
+        return of_all(mesh, normal, offset, edge)
+
+    monkeypatch.setattr(symmetry, "_plane", counted)
+    before = mirror_planes(points, quads, part)
+    all_of_them = len(judged)
+    monkeypatch.setattr(symmetry, "_MANY", 0)
+    after = mirror_planes(points, quads, part)
+    assert [(p.name, p.mean, p.most) for p in after] == [(p.name, p.mean, p.most) for p in before]
+    assert len(after) <= len(judged) - all_of_them < all_of_them
+    assert bool(after) is (bent == 0.0)
 
 
 def test_a_named_plane_is_taken_however_badly_it_fits() -> None:
