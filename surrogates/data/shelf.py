@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 # Bytes up to which an array stays in memory.
-IN_MEMORY = 256 << 20
+IN_MEMORY = 64 << 20
 
 
 class Shelf:
