@@ -19,6 +19,7 @@ LATENT = 48  # the cascade's latent numbers in the fast preset
 
 POD_GPR = Kind("pod-gpr", "pod-gpr", PHYSICS)
 POD_GPR_WITHOUT = Kind("pod-gpr-without-physics", "pod-gpr", WITHOUT, "without physics")
+POD_GPR_COARSE = Kind("pod-gpr-with-coarse-runs", "pod-gpr", PHYSICS, "with coarse runs", coarse=True)
 POD_RBF = Kind("pod-rbf", "pod-rbf", PHYSICS)
 PODNN = Kind("podnn", "podnn", (*EPOCHS, *PHYSICS))
 PODNN_WIDE = Kind("podnn-wide", "podnn", (*EPOCHS, *PHYSICS, f"level.latent={LATENT}"), f"with {LATENT} modes")
@@ -30,6 +31,6 @@ GAENN = Kind("gaenn", "gaenn", ("level.epochs=6",))
 
 PLAN = Plan(
     "bumper_fine", RUNS, TRAIN, NODES,
-    table=(POD_GPR, POD_GPR_WITHOUT, POD_RBF, PODNN, PODNN_WIDE, MH, AENN, GAENN),
-    curves=(POD_GPR, POD_GPR_WITHOUT, MH, MH_WITHOUT), sizes=SIZES, unit="mm",
+    table=(POD_GPR, POD_GPR_WITHOUT, POD_GPR_COARSE, POD_RBF, PODNN, PODNN_WIDE, MH, AENN, GAENN),
+    curves=(POD_GPR, POD_GPR_WITHOUT, POD_GPR_COARSE, MH, MH_WITHOUT), sizes=SIZES, unit="mm", coarse="bumper_coarse",
 )  # fmt: skip

@@ -3,8 +3,9 @@
     python examples/bumper_study/study.py bumper_fine.h5 -o study            hours on two cores: begin with --only 'pod-*'
     python examples/bumper_study/study.py bumper_fine.h5 -o study --quick    one seed, an eighth of the epochs
 
-`bumper_fine.h5` comes from `unpack.py` beside the campaign. The study can be stopped at any moment and started again
-with the same command: what is finished is kept, an interrupted training goes on from its last checkpoint.
+`bumper_fine.h5` comes from `unpack.py` beside the campaign; with `--coarse bumper_coarse.h5` models also learn from coarse
+runs. The study can be stopped at any moment and started again with the same command: what is finished is kept, an
+interrupted training goes on from its last checkpoint.
 """
 
 from __future__ import annotations

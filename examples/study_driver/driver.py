@@ -69,12 +69,15 @@ def crashkit(*arguments: str | Path, log: Path | None = None, threads: int = 0) 
         raise SystemExit(f"crashkit {arguments[0]} ended with code {code}" + (f"; see {log}" if log else ""))
 
 
-def prepare(plan: Plan, source: Path, home: Path) -> Path:
-    """The dataset with its hierarchy; made once."""
+def prepare(plan: Plan, source: Path, home: Path, coarse: Path | None = None) -> Path:
+    """The dataset with its hierarchy, and beside it that of coarse runs; made once."""
     data, done = home / f"{plan.name}.zarr", home / "levels.png"
     if not done.exists():
         crashkit("ingest", source, "-o", data)
         crashkit("coarsen", data, "--nodes", plan.nodes, "--test", plan.test, "--picture", done)
+    beside = home / f"{plan.coarse}.zarr"
+    if coarse is not None and not beside.exists():
+        crashkit("ingest", coarse, "-o", beside)
     return data
 
 
@@ -128,6 +131,10 @@ def main(plan: Plan, tables: Tables, about: str, arguments: Sequence[str] | None
     """The command line of a study: `tables` writes what is special to it, `about` is its help."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source", type=Path, help="the campaign's HDF5 file")
+    if plan.coarse:
+        parser.add_argument(
+            "--coarse", type=Path, help="HDF5 file of coarse runs; without it, no model learns from them"
+        )
     parser.add_argument("-o", "--output", type=Path, default=Path("study"), help="folder for everything")
     parser.add_argument("--quick", action="store_true", help="one seed and an eighth of the epochs, in OUTPUT/quick")
     parser.add_argument("--seeds", type=int, default=3, help="trainings of each model (3)")
@@ -138,11 +145,13 @@ def main(plan: Plan, tables: Tables, about: str, arguments: Sequence[str] | None
     parser.add_argument("--no-report", action="store_true", help="train only, and leave the test runs alone")
     given = parser.parse_args(arguments)
     given.output.mkdir(parents=True, exist_ok=True)
-    data = prepare(plan, given.source, given.output)
+    coarse = given.coarse if plan.coarse else None
+    data = prepare(plan, given.source, given.output, coarse)
     home = given.output / "quick" if given.quick else given.output
     study = Study(plan, data, home, 1 if given.quick else given.seeds, given.quick)
     home.mkdir(exist_ok=True)
-    train_all(wanted(study.jobs(), given.only), study, given.jobs)
+    possible = [job for job in study.jobs() if coarse is not None or not job.kind.coarse]
+    train_all(wanted(possible, given.only), study, given.jobs)
     if not given.quick:
         train_all(wanted(plan.timed(), given.only), study, at_once=1)
     if given.no_report:

@@ -22,12 +22,15 @@ class Kind:
         As `--model` and `--set` take them.
     note
         What its name in learning curves says beside that of the model.
+    coarse
+        Whether it also learns from runs of a coarser solver mesh.
     """
 
     name: str
     model: str
     settings: tuple[str, ...] = ()
     note: str = ""
+    coarse: bool = False
 
     def label(self, level: str) -> str:
         """What learning curves call level `level` ("MH1", "POD-GPR") of it."""
@@ -71,6 +74,8 @@ class Plan:
         Models of the full study that are judged on validation runs alone.
     unit
         Of lengths in tables: cm or mm.
+    coarse
+        Name of the dataset of runs of a coarser solver mesh, where kinds learn from them.
     """
 
     name: str
@@ -83,6 +88,7 @@ class Plan:
     beside: tuple[Kind, ...] = ()
     alternatives: tuple[Kind, ...] = ()
     unit: str = "cm"
+    coarse: str = ""
 
     @property
     def test(self) -> str:
@@ -117,12 +123,13 @@ class Plan:
         return [Job(alone(kind)) for kind in self.table if kind.model in NETWORKS]
 
     def command(self, job: Job, data: Path, home: Path) -> list[str]:
-        """The arguments of `crashkit`."""
+        """The arguments of `crashkit`; the dataset of coarse runs lies beside `data`."""
         own = [part for setting in job.kind.settings for part in ("--set", setting)]
         first = self.train if job.runs is None else job.runs
         return [
             "train", str(data), "-o", str(home / job.folder), "--model", job.kind.model,
             "--test", f"{first}:{self.runs}", "--seed", str(job.seed), "--device", "cpu", *own,
+            *(["--coarse", str(data.with_name(f"{self.coarse}.zarr"))] if job.kind.coarse else []),
         ]  # fmt: skip
 
 

@@ -145,6 +145,22 @@ def test_the_report_is_made_again_once_more_models_are_trained(kart, small, comm
     assert "--overwrite" in commands[-1]
 
 
+def test_coarse_runs_are_read_and_learnt_from_where_they_are_given(kart, small, commands, tmp_path):
+    jobs = kart["jobs"]
+    both = jobs.Kind("both", "pod-gpr", note="with coarse runs", coarse=True)
+    plan = replace(small, table=(*small.table, both), coarse="coarse")
+    kart["driver"].main(plan, lambda study: [], "", ["kart.h5", "-o", str(tmp_path), "--seeds", "1"])
+    assert not any("--coarse" in command for command in commands)
+    given = ["kart.h5", "--coarse", "coarse.h5", "-o", str(tmp_path), "--seeds", "1"]
+    commands.clear()
+    kart["driver"].main(plan, lambda study: [], "", given)
+    coarse = str(tmp_path / "coarse.zarr")
+    assert commands[0] == ("ingest", "coarse.h5", "-o", coarse)
+    (trained,) = (command for command in commands if command[0] == "train")
+    assert trained[2:4] == ("-o", str(tmp_path / "models" / "both-seed-0"))
+    assert trained[-2:] == ("--coarse", coarse)
+
+
 def test_an_interrupted_training_is_resumed(kart, small, commands, tmp_path):
     study = kart["driver"].Study(small, tmp_path / "kart.zarr", tmp_path, 1)
     first, second = small.jobs(1)[:2]
