@@ -20,6 +20,19 @@ def refuse_earlier(output: Path, mark: str, what: str, option: str = "-o") -> No
         )
 
 
+def check_folder(output: Path, mark: str) -> None:
+    """Raise OutputError if `complete_folder` could not make `output`: better now than after the work."""
+    if output.exists() and not (output / mark).exists() and (not output.is_dir() or any(output.iterdir())):
+        raise OutputError(
+            f"{output}: exists and holds no {mark}; expected a new folder, or an earlier result to replace"
+        )
+    home = next(place for place in output.absolute().parents if place.exists())
+    if not home.is_dir():
+        raise OutputError(f"{output}: no folder can be made there ({home} is a file); choose another with -o")
+    if not os.access(home, os.W_OK | os.X_OK):
+        raise OutputError(f"{output}: no folder can be made there (no permission in {home}); choose another with -o")
+
+
 @contextlib.contextmanager
 def complete_folder(output: Path, mark: str) -> Iterator[Path]:
     """A new folder beside `output` that takes its place when the block ends well, and vanishes otherwise.
@@ -34,10 +47,7 @@ def complete_folder(output: Path, mark: str) -> Iterator[Path]:
     OutputError
         Where `output` is something else, or nothing can be written there.
     """
-    if output.exists() and not (output / mark).exists() and (not output.is_dir() or any(output.iterdir())):
-        raise OutputError(
-            f"{output}: exists and holds no {mark}; expected a new folder, or an earlier result to replace"
-        )
+    check_folder(output, mark)
     try:
         with contextlib.ExitStack() as stack:
             try:

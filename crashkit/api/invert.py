@@ -26,6 +26,9 @@ _MOST_ROWS = 300
 _FAR = 0.05
 # An explanation with less of the posterior is none.
 _SHARE = 0.05
+# Measured displacements so many times smaller or larger than those of all training runs are of another size; factors
+# between units that are taken for one another.
+_OTHER, _MISTAKEN = 1.5, (10.0, 0.1, 1000.0, 1e-3, 100.0, 0.01, 25.4, 1 / 25.4)
 # Worse explained than all but this share of the training runs by their own parameters.
 _RARE = 0.02
 
@@ -221,7 +224,14 @@ def invert(
     residual = _residual(table, values, rows, misfit, found.best)
     factors = tuple(factor for _, factor in ranges.written)
     units = tuple("" if unit == "1" else unit for unit, _ in ranges.written)
-    warnings = _warnings(found, misfit, residual, ranges.names, units, np.array(factors))
+    warnings = [
+        *(
+            f"{sentence}: it is held there, where the model extrapolates"
+            for sentence in _known_outside(surrogate, known)
+        ),
+        *_another_size(misfit),
+        *_warnings(found, misfit, residual, ranges.names, units, np.array(factors)),
+    ]
     return Inversion(
         tuple(ranges.names), units, factors, found, residual, tuple(warnings), tuple(notes), misfit
     )  # fmt: skip
@@ -354,6 +364,36 @@ def _residual(
     )
 
 
+def _known_outside(surrogate: Surrogate, known: Mapping[str, Any] | None) -> list[str]:
+    """A sentence for each known parameter beyond its trained range."""
+    import numpy as np
+
+    ranges = surrogate.record.ranges
+    values = (ranges.low + ranges.high) / 2
+    for name, value in known_values(known or {}, surrogate).items():
+        values[ranges.names.index(name)] = value
+    return list(ranges.beyond(values, np.array(ranges.time)).values())
+
+
+def _another_size(misfit: Misfit) -> list[str]:
+    """A sentence where the structure of no training run moves about as far at the measured points as was measured."""
+    import numpy as np
+
+    def size(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(np.sqrt(np.square(values).mean(axis=-1)))
+
+    ours, theirs = float(size(misfit.measured.value)), size(misfit.predicted(misfit.runs))
+    low, high = float(theirs.min()) / _OTHER, float(theirs.max()) * _OTHER
+    if low <= ours <= high or not ours:
+        return []
+    fits = [f for f in _MISTAKEN if low * _OTHER <= ours * f <= high / _OTHER]
+    hint = f"; {fits[0]:g} times as much would fit, so a wrong unit is likely" if fits else ""
+    return [
+        f"measured displacements are {100 * ours:.3g} cm (root mean square), those of the training runs at these points "
+        f"{100 * theirs.min():.3g} to {100 * theirs.max():.3g} cm{hint}: check the units of the columns"
+    ]
+
+
 def _warnings(
     found: ParameterPosterior,
     misfit: Misfit,
@@ -387,6 +427,13 @@ def _warnings(
         out.append(
             f"{names[k]} is at the edge of the trained range ({edge / factors[k]:.4g} {units[k]}".rstrip()
             + "); the truth may lie beyond it, where the model knows nothing"
+        )
+    low, high = found.interval()
+    aside = [n for n, b, lo, hi in zip(names, found.best, low, high, strict=True) if not lo <= b <= hi]
+    if aside:
+        out.append(
+            f"{', '.join(aside)}: the most likely value lies outside the 90 % interval, since the distribution is lopsided or "
+            "has several tops (pairs.png shows it); do not use the most likely value alone"
         )
     wide = [n for n, w in zip(names, found.hardly_told(), strict=True) if w]
     if wide:

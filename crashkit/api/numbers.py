@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.api._predicted import FormulaMesh, GivenRuns, PredictedRuns, dry_runs, true_runs
+from crashkit.errors import DataError
 from evaluation.measures.formula import Formula, Value, read_formulas
 
 if TYPE_CHECKING:
@@ -39,12 +40,17 @@ class NumberJudge:
         ------
         EvaluationError
             For a text that is no formula, and for fields, parts or histories that the data do not have.
+        DataError
+            For a number that is called as a parameter.
         """
         from surrogates.training.train import curve_targets
 
         if not settings.kpi:
             return None
         formulas = read_formulas(settings.kpi)
+        for name in formulas:
+            if name in campaign.parameter_names:
+                raise DataError(f"kpi.{name} has the name of a parameter of the dataset; give the number another one")
         channels = [c.name for c in curve_targets(campaign, settings)]
         runs = dry_runs(campaign, channels)
         for formula in formulas.values():

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from crashkit.api.model import Model
     from evaluation.measures.formula import Formula, Limit, Value
+    from surrogates.data.inputs import Ranges
     from surrogates.queries.optimum import LocalAnswer, Problem
     from surrogates.surrogate import Surrogate
 
@@ -171,6 +172,9 @@ def optimise(
         low[ranges.names.index(name)] = high[ranges.names.index(name)] = given
     if not (high > low).any():
         raise DataError("all parameters are given; leave at least one to be chosen")
+    for name in formulas:
+        if name in ranges.names:
+            raise DataError(f"{name} is a parameter of the model; give the number {formulas[name].text} another name")
     sign = 1.0 if maximise is None else -1.0
     time = surrogate.record.time
 
@@ -211,7 +215,10 @@ def optimise(
         earlier.append(change)
     best = found[0]
     kept = (errors + best.excess <= _ACTIVE * 0.1 * box.scale[1:]).mean(axis=0)
-    notes = [f"{len(found)} local answers from {starts} starts; derivatives by finite differences of the model"]
+    notes = [
+        _searched(ranges, low, high),
+        f"{len(found)} local answers from {starts} starts; derivatives by finite differences of the model",
+    ]
     if bounds:
         notes.append(
             f"limits tightened by {told}"
@@ -235,6 +242,23 @@ def optimise(
         confirm=_confirm(ranges.names, units, factors, found, plain or best, low, high, runs),
         others=tuple(found[1:]),
         notes=tuple(notes),
+    )
+
+
+def _searched(ranges: Ranges, low: Floats, high: Floats) -> str:
+    """Which parameters are free and which are given, in the units of their tables."""
+    spans = zip(ranges.names, low, high, ranges.written, strict=True)
+    free, given = [], []
+    for name, least, most, (unit, factor) in spans:
+        behind = "" if unit in ("", "1") else f" {unit}"
+        if most > least:
+            free.append(f"{name} ({least / factor:.4g} to {most / factor:.4g}{behind})")
+        else:
+            given.append(f"{name} = {least / factor:.4g}{behind}")
+    first = free[0].split(" (")[0]
+    held = f"; given: {', '.join(given)}" if given else ""
+    return (
+        f"free, loads too: {', '.join(free)}{held}; a load that is not yours to choose is held with --known {first}=.."
     )
 
 

@@ -26,6 +26,8 @@ Floats = NDArray[np.float64]
 
 # Bytes of fields in memory at once; draws and nodes of a part that are kept for the principal components.
 _AT_ONCE = 64 << 20
+# With fewer draws, percentiles and influences are chance.
+_FEW_DRAWS = 100
 _KEPT_DRAWS, _KEPT_NODES = 256, 48
 # Draws whose shape at the end is compared, and nodes of it.
 _SHAPES, _SHAPE_NODES = 20_000, 200
@@ -104,12 +106,14 @@ def scatter(
     from crashkit.api._predicted import FormulaMesh
     from crashkit.api.numbers import model_formulas
     from crashkit.api.predict import model_in_hand
-    from crashkit.output import complete_folder, refuse_earlier
+    from crashkit.output import check_folder, complete_folder, refuse_earlier
     from evaluation.measures.formula import read_formulas, read_limit
     from evaluation.scatter.draws import draw
 
     if output is not None and not overwrite:
         refuse_earlier(Path(output), "scatter.json", "scatter")
+    if output is not None:
+        check_folder(Path(output), "scatter.json")
     tell = watched(report, progress)
     trained = model_in_hand(model)
     surrogate = trained.surrogate
@@ -255,7 +259,7 @@ class _Study:
             mean=tally.mean,
             deviation=tally.deviation,
             doubt=doubt,
-            warnings=_outside(ranges, self.scatters, inside),
+            warnings=(*_too_few(len(draws)), *_outside(ranges, self.scatters, inside)),
             about={},
         )
 
@@ -353,6 +357,10 @@ def _scatters(
         text, _, own = str(given).partition(":") if isinstance(given, str) else ("", "", "")
         if own.strip() not in ("", "normal", "uniform"):
             raise DataError(f"{name}={given}: {own.strip()!r} is no kind of scatter; expected normal or uniform")
+        if text.strip().startswith("-"):
+            raise DataError(
+                f"{name}={given}: a scatter has no sign, it goes to both sides; write {name}={text.strip()[1:]}"
+            )
         percent = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*%\s*", text)
         if percent is not None and ranges.units[k] not in ("%", "percent"):
             width = float(percent[1]) / 100 * abs(nominal[k])
@@ -367,6 +375,15 @@ def _scatters(
             raise DataError(f"{name}={given}: expected a width above zero, such as {name}=5%")
         out.append(Scatter(name, ranges.units[k], float(nominal[k]), width, own.strip() or shape))  # type: ignore[arg-type]
     return nominal, tuple(out)
+
+
+def _too_few(draws: int) -> tuple[str, ...]:
+    """A sentence where there are so few draws that shares and percentiles say little."""
+    if draws >= _FEW_DRAWS:
+        return ()
+    return (
+        f"{draws} draws are few: percentiles, probabilities and influences need at least {_FEW_DRAWS}; take more with -n",
+    )
 
 
 def _outside(ranges: Ranges, scatters: Sequence[Scatter], inside: NDArray[np.bool_]) -> tuple[str, ...]:

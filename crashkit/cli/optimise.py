@@ -89,8 +89,8 @@ def command(
             ("limit", "predicted", "margin", "left", "active", "kept (%)", "price"),
             (
                 (
-                    r["limit"], f"{r['predicted']:.4g}", f"{r['margin']:.2g}", f"{r['slack']:.2g}",
-                    "yes" if r["active"] else "", f"{100 * r['probability']:.0f}", f"{r['price']:.3g}",
+                    r["limit"], *(f"{r[name]:{digits}} {r['unit']}".removesuffix(" 1").rstrip() for name, digits in _LENGTHS),
+                    "yes" if r["active"] else "", f"{100 * r['probability']:.0f}", _price(r["price"], found.unit, r["unit"]),
                 )
                 for _, r in found.limits.iterrows()
             ),
@@ -98,3 +98,14 @@ def command(
     what_next(
         output / "confirm.csv", ("predict", model, "--params", output / "confirm.csv", "-o", output / "predicted")
     )
+
+
+# Columns in the unit of the limit, and their digits.
+_LENGTHS = (("predicted", ".4g"), ("margin", ".2g"), ("slack", ".2g"))
+
+
+def _price(value: float, unit: str, of: str) -> str:
+    """What one unit of a limit costs."""
+    mine, its = ("" if u == "1" else u for u in (unit, of))
+    behind = f" {mine or 1} per {its}" if its else f" {mine}"
+    return f"{value:.3g}{behind}".rstrip() if value else "0"

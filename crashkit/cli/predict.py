@@ -185,4 +185,7 @@ def _readable(value: float, unit: str, half_width: float | None) -> str:
 
     shown, name = readable(np.array([value, half_width or 0.0]), unit)
     band = "" if half_width is None else f" ± {shown[1]:.3g}"
-    return f"{shown[0]:.4g}{band} {name}".rstrip()
+    useless = half_width is not None and half_width > abs(value)
+    return f"{shown[0]:.4g}{band} {name}".rstrip() + (
+        " (the band is wider than the value, which says next to nothing)" if useless else ""
+    )

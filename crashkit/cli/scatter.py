@@ -76,6 +76,7 @@ def command(
     from evaluation.report.page import plain
     from evaluation.scatter.page import limit_table, number_table, part_table
 
+    say(f"nominal: {result.about['Nominal']}")
     chances = limit_table(result)
     for columns, title in (
         (

@@ -93,7 +93,7 @@ class ScatterResult:
     doubt
         Where the model's own uncertainty was taken from; empty where it has none.
     warnings
-        Sentences about draws outside the trained range.
+        Sentences about too few draws, and draws outside the trained range.
     about
         Further facts: model, seed, plan of the draws.
     """

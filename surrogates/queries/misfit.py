@@ -73,6 +73,8 @@ class Misfit:
         Error of the measured run against that of a typical one, as far as the model tells; see `sized`.
     power
         What the likelihood is raised to.
+    runs
+        (run, parameter) of the training runs, or points that stand for them.
     """
 
     def __init__(self, points: AtPoints, measured: Measured, free: NDArray[np.bool_] | None = None) -> None:
@@ -80,7 +82,7 @@ class Misfit:
         surrogate = points.surrogate
         ranges = surrogate.record.ranges
         self.free = ranges.high > ranges.low if free is None else free
-        runs = _training_parameters(surrogate)
+        self.runs = runs = _training_parameters(surrogate)
         found = points.left_out()
         patterns = (
             error_patterns(self.predicted, surrogate, runs)

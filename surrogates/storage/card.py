@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
+import numpy as np
 import yaml
 
 if TYPE_CHECKING:
@@ -66,7 +67,7 @@ def card(surrogate: Surrogate) -> str:
     else:
         lines.append("None were held out, so there is no independent error here.")
     lines += ["", *_bands(surrogate), *_hard(surrogate)]
-    lines += _elements(surrogate)
+    lines += [*_elements(surrogate), *_curves(surrogate), *_numbers(surrogate)]
     lines += ["", "## Data", "", f"- dataset checksum (SHA-256): `{record.checksum or 'not recorded'}`"]
     lines += [f"- {_plain(key)}: {_plain(value)}" for key, value in record.attributes.items()]
     lines += [
@@ -147,6 +148,45 @@ def _elements(surrogate: Surrogate) -> list[str]:
             out += ["", "Mean absolute error over living elements of training runs that folds left out:", ""]
             out += _table(("with", "error"), [(what, f"{error:.4g}") for what, error in known.errors.items()])
     return out
+
+
+def _curves(surrogate: Surrogate) -> list[str]:
+    """How well time histories are told of training runs that folds left out."""
+    rows = []
+    for name, curve in surrogate.curves.items():
+        size = float(np.sqrt(np.square(curve.values @ curve.modes).mean()))
+        error = curve.errors.get("chosen", float("nan"))
+        rows.append((name, curve.unit or "1", *("-" if v != v else f"{v:.4g}" for v in (error, size))))
+    if not rows:
+        return []
+    return [
+        "",
+        "## Histories",
+        "",
+        "Root mean square over samples and runs of the error on training runs that folds left out, and of the channel itself:",
+        "",
+        *_table(("channel", "unit", "error", "size"), rows),
+    ]
+
+
+def _numbers(surrogate: Surrogate) -> list[str]:
+    """How well numbers by formula are told of runs that were left out."""
+    rows = []
+    for name, told in surrogate.record.numbers.items():
+        errors = np.abs(list(told["errors"].values()))
+        mean = f"{errors.mean():.4g}" if len(errors) else "-"
+        size = "-" if told["size"] is None else f"{told['size']:.4g}"
+        rows.append((name, str(told["formula"]), str(told["unit"]), str(len(errors)), mean, size))
+    if not rows:
+        return []
+    return [
+        "",
+        "## Numbers by formula",
+        "",
+        "Mean absolute error on runs that were left out, and mean size:",
+        "",
+        *_table(("number", "formula", "unit", "runs", "error", "size"), rows),
+    ]
 
 
 def _physics(surrogate: Surrogate) -> list[str]:

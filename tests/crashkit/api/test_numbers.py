@@ -17,6 +17,8 @@ from crashkit.api.numbers import half_width
 from crashkit.api.scatter import scatter
 from crashkit.api.source import source_of
 from crashkit.cli import app
+from crashkit.cli.predict import _readable
+from crashkit.errors import DataError
 from data_schema.progress import silent
 from evaluation.comparison.split import Split, entries
 from evaluation.drawing.style import Sheet
@@ -26,6 +28,7 @@ from evaluation.figures.kind import drawn, to_csv
 from evaluation.figures.numbers import FIGURE as NUMBERS
 from surrogates.errors import SurrogateError
 from surrogates.settings import settings
+from surrogates.storage.card import card
 
 KPI = {
     "intrusion": "max(displacement(part=box, along=x))",
@@ -92,6 +95,27 @@ def test_errors_on_left_out_runs_are_kept_with_the_model(model: crashkit.Model, 
     assert "intrusion: 0." in done.stderr
     assert "peak: " in done.stderr
     assert np.load(tmp_path / "p.npz")["peak"] == pytest.approx(float(model.predict(WHERE)["peak"]), rel=1e-5)
+
+
+def test_the_card_lists_histories_and_numbers_with_their_errors(model: crashkit.Model) -> None:
+    told = card(model.surrogate)
+    wanted = model.record.numbers["intrusion"]
+    error = np.mean(np.abs(list(wanted["errors"].values())))
+    assert f"| {error:.4g} |" in next(line for line in told.splitlines() if line.startswith("| intrusion |"))
+    name, curve = next(iter(model.surrogate.curves.items()))
+    assert f"| {curve.errors['chosen']:.4g} |" in next(
+        line for line in told.splitlines() if line.startswith(f"| {name} |")
+    )
+
+
+def test_a_number_called_as_a_parameter_is_refused_before_the_training(runs: xr.Dataset) -> None:
+    with pytest.raises(DataError, match=r"kpi\.yield_stress has the name of a parameter"):
+        crashkit.train(runs, model="pod-gpr", settings={"kpi": {"yield_stress": "max(displacement())"}})
+
+
+def test_a_band_wider_than_the_value_says_so() -> None:
+    assert "wider than the value" in _readable(0.01, "m", 0.02)
+    assert "wider" not in _readable(0.02, "m", 0.01)
 
 
 def test_scatter_knows_the_numbers_of_the_model(model: crashkit.Model) -> None:

@@ -106,7 +106,7 @@ def test_draws_outside_the_trained_range_are_told(model: crashkit.Model) -> None
     wide = scatter(
         model, {"impact_speed": "20%:uniform"}, at={"impact_speed": 28}, draws=64, limits=["displacement() < 0.4 m"]
     )
-    assert "% of the draws of impact_speed lie outside the trained range" in wide.warnings[0]
+    assert "% of the draws of impact_speed lie outside the trained range" in wide.warnings[-1]
     assert 0 < wide.inside.mean() < 1
     assert wide.scatter[0].shape == "uniform"
     assert wide.scatter[0].width == pytest.approx(5.6)
@@ -121,7 +121,7 @@ def test_draws_outside_the_trained_range_are_told(model: crashkit.Model) -> None
         ({"impact_angle": "5%"}, {"at": {"impact_angle": 0}}, "the nominal value is zero"),
         ({"impact_speed": "2kg"}, {}, "the unit 'kg' is not one of impact_speed"),
         ({"impact_speed": "5%:triangle"}, {}, "'triangle' is no kind of scatter"),
-        ({"impact_speed": "-1"}, {}, "expected a width above zero"),
+        ({"impact_speed": "0"}, {}, "expected a width above zero"),
         ({"impact_speed": "1"}, {"at": {"impact_speed": 99}}, "far outside"),
         ({"impact_speed": "1"}, {"limits": ["dent < 3"]}, "dent is no history, parameter or number"),
         ({"impact_speed": "1"}, {"limits": ["max(displacement()) < 3 N"]}, "the limit is in N"),
@@ -198,3 +198,28 @@ def test_a_table_that_is_there_is_not_lost(model: crashkit.Model, tmp_path: Path
     with pytest.raises(OutputError, match=r"holds no scatter\.json"):
         scatter(model, VARY, tmp_path, draws=8)
     assert (tmp_path / "mine.txt").exists()
+
+
+def test_few_draws_are_told_and_nominal_values_are_printed(model: crashkit.Model, tmp_path: Path) -> None:
+    model.save(tmp_path / "model")
+    told = CliRunner().invoke(
+        app, ["scatter", str(tmp_path / "model"), "--vary", "impact_speed=5%", "-n", "2", "-o", str(tmp_path / "out")]
+    )
+    assert told.exit_code == 0, told.output
+    said = " ".join(told.output.split())
+    assert "2 draws are few" in said
+    assert "nominal: impact_speed" in said
+
+
+def test_a_place_that_cannot_be_written_is_refused_before_drawing(
+    model: crashkit.Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr("crashkit.api.scatter._Study.check", lambda *_: pytest.fail("it went on"))
+    with pytest.raises(OutputError, match="no folder can be made there"):
+        scatter(model, VARY, tmp_path / "file" / "out", draws=100)
+
+
+def test_a_negative_scatter_is_explained(model: crashkit.Model) -> None:
+    with pytest.raises(DataError, match="a scatter has no sign, it goes to both sides; write impact_speed=5%"):
+        scatter(model, {"impact_speed": "-5%"}, draws=100)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from test_train_command import dataset, run
 
 import crashkit
+from crashkit.api.invert import _warnings
 from crashkit.errors import CrashkitError
 
 TRUE = np.array([[22.0, 4.0, 3e8]])
@@ -118,3 +120,29 @@ def test_places_elsewhere_and_lengths_without_units(model: Path, moved: np.ndarr
         crashkit.invert(model, by_node(moved), noise="1kg")
     with pytest.raises(CrashkitError, match="noise 3: in which unit"):
         crashkit.invert(model, by_node(moved), noise="3")
+
+
+@pytest.mark.parametrize(("factor", "told"), [(0.1, "10 times as much"), (10.0, "0.1 times as much")])
+def test_lengths_in_a_wrong_unit_are_told(model: Path, moved: np.ndarray, factor: float, told: str) -> None:
+    found = crashkit.invert(model, by_node(factor * moved))
+    said = [w for w in found.warnings if "root mean square" in w]
+    assert len(said) == 1
+    assert told in said[0]
+    assert "check the units" in said[0]
+
+
+def test_known_values_beyond_the_trained_range_are_told(model: Path, moved: np.ndarray) -> None:
+    known = {"impact_angle": "15degree", "yield_stress": 3e8}
+    found = crashkit.invert(model, by_node(moved), known=known)
+    assert any("impact_angle = 15 degree is outside the trained range" in w for w in found.warnings)
+    inside = crashkit.invert(model, by_node(moved), known={"impact_angle": 4.0, "yield_stress": 3e8})
+    assert not any("outside the trained range" in w for w in inside.warnings)
+
+
+def test_a_best_value_outside_its_interval_is_told(model: Path, moved: np.ndarray) -> None:
+    found = crashkit.invert(model, by_node(moved))
+    post = found.posterior
+    elsewhere = replace(post, explanations=(replace(post.explanations[0], parameters=post.high.copy()),))
+    said = _warnings(elsewhere, found._misfit, found.residual, found.names, found.units, np.ones(3))
+    assert any(w.startswith("impact_speed, impact_angle") and "outside the 90 % interval" in w for w in said)
+    assert not any("outside the 90 % interval" in w for w in found.warnings)

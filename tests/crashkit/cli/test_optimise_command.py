@@ -86,3 +86,22 @@ def test_where_nothing_is_feasible_the_least_broken_is_named(model: Path, tmp_pa
 def test_what_cannot_be_asked(model: Path, arguments: dict, message: str) -> None:
     with pytest.raises((CrashkitError, EvaluationError), match=message):
         crashkit.optimise(model, **arguments)
+
+
+def test_free_parameters_are_named_first_and_limits_carry_units(model: Path, tmp_path: Path) -> None:
+    code, out, err = run(
+        "optimise", model, "--maximise", "impact_speed", "--subject-to", f"{DENT} < 300 mm", "--known", "yield_stress=400MPa",
+        "-o", tmp_path / "best", "--starts", 1,
+    )  # fmt: skip
+    assert code == 0, err
+    said = " ".join((err + out).split())
+    assert "free, loads too: impact_speed (" in said
+    assert "given: yield_stress = 4e+08 Pa" in said
+    assert "held with --known impact_speed=" in said
+    found = pd.read_csv(tmp_path / "best" / "limits.csv")
+    assert f"{found['predicted'][0]:.4g} m" in out
+
+
+def test_a_number_with_the_name_of_a_parameter_is_refused(model: Path) -> None:
+    with pytest.raises(CrashkitError, match="impact_speed is a parameter of the model"):
+        crashkit.optimise(model, "impact_speed", numbers={"impact_speed": "2 * impact_angle"})
