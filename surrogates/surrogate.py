@@ -18,9 +18,8 @@ from surrogates.errors import SurrogateError
 from surrogates.local_errors import HARD, LocalErrors
 from surrogates.models.curves import Curve
 from surrogates.models.element_field import ElementField, faces_to_level
-from surrogates.models.pod_regression import PodRegression
+from surrogates.models.pod_regression import PodRegression, from_coarse_run
 from surrogates.models.removal import Removal
-from surrogates.physics.clock import between
 from surrogates.physics.registration import Registration
 from surrogates.record import Fit, Record
 from surrogates.settings import Settings
@@ -171,15 +170,7 @@ class Surrogate:
             raise SurrogateError(f"the model takes nothing from coarse runs{why}; train pod-gpr with --coarse")
         if len(values) != 1:
             raise SurrogateError(f"one coarse run was given for parameters of {len(values)} runs")
-        seen = core.base.project(states, core.modes)
-        clock, grid = self.registration.clock, self.registration.grid
-        course = (
-            between(seen, states_time, grid) if clock.is_identity else clock.apply(seen, values[0], states_time, grid)
-        )
-        out: NDArray[np.float32] = self.registration.undo(
-            lambda x, t: core.displacement(x, t, coarse=course[None]), values, times
-        )[0]
-        return out
+        return from_coarse_run(core, self.registration, values, states, states_time, times)
 
     def predict_nodes(
         self, parameters: ArrayLike, nodes: NDArray[np.int64], time: ArrayLike | None = None, level: int | None = None

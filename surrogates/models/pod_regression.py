@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -23,6 +23,7 @@ from surrogates.errors import SurrogateError
 from surrogates.models.coarse_base import CoarseBase
 from surrogates.models.coarse_fit import CoarseFit, fit_coarse
 from surrogates.physics.choice import Worth, choose, not_used
+from surrogates.physics.clock import between
 from surrogates.physics.registration import Registration
 from surrogates.physics.trials import Courses, Folds, Trials, courses_of, one_thread
 from surrogates.physics.weigher import Machine
@@ -196,7 +197,7 @@ class PodChoice:
 class PodFit:
     """A fitted POD regression of the registered campaign, and how it was chosen.
 
-    trials  what everything was chosen with
+    trials  what everything was chosen with, and the place of the chosen plane among its mirrors
     held    calls back with each training run and what the model made without it says of it
     coarse  what folds said of coarse runs; None without any
     itself  as `held`, of those that have a coarse run of the same parameters, and starting from it
@@ -208,6 +209,7 @@ class PodFit:
     worth: Worth
     held: Callable[[], Iterator[Held]]
     trials: Trials
+    plane: int = 0
     coarse: CoarseFit | None = None
     itself: Callable[[], Iterator[Held]] | None = None
 
@@ -237,40 +239,55 @@ def fit_pod_regression(
     trials = Trials(courses, campaign.parameters[chosen], folds, settings.model, settings.seed)
     with one_thread():
         best, core, choice, worth = _chosen(campaign, settings, chosen, trials, notes)
-        coarse = (
-            None if campaign.coarse is None else _beneath(campaign.coarse, best, core, choice, trials, settings, notes)
-        )
     core.modes = np.ascontiguousarray(courses.modes @ core.modes)
-    fit = PodFit(core, best.registration, choice, worth, lambda: _held(best, trials, settings, choice.modes), trials)
-    if coarse is None:
-        return fit
-    fit.coarse = coarse
-    if coarse.base is not None:
-        fit.held = lambda: _held_over(coarse, core.modes, itself=False)
-        fit.itself = lambda: _held_over(coarse, core.modes, itself=True)
-    return fit
+    fit = PodFit(
+        core, best.registration, choice, worth, lambda: _held(best, trials, settings, choice.modes), trials, best.plane
+    )
+    return fit if campaign.coarse is None else with_coarse(fit, campaign.coarse, settings, notes)
 
 
-def _beneath(
-    coarse: CoarseRuns,
-    candidate: _Candidate,
-    core: PodRegression,
-    choice: PodChoice,
-    trials: Trials,
-    settings: Settings,
-    notes: Notes,
-) -> CoarseFit:
-    """Put coarse runs beneath `core`, if folds show a gain; its modes are those of the common basis still."""
-    turn = _rotation(trials.values(candidate.registration, candidate.plane))
-    count = min(max(settings.pod.modes), trials.courses.own.shape[2])
-    every = turn(trials.courses.own.shape[2])
-    found = fit_coarse(coarse, trials, candidate.registration, candidate.plane, every, count, settings, notes)
+def with_coarse(fit: PodFit, coarse: CoarseRuns, settings: Settings, notes: Notes) -> PodFit:
+    """`fit` with coarse runs beneath, if folds show a gain; else `fit` with what folds said of them."""
+    trials, registration = fit.trials, fit.registration
+    most = trials.courses.own.shape[2]
+    with one_thread():
+        every = _rotation(trials.values(registration, fit.plane))(most)
+        count = min(max(settings.pod.modes), most)
+        found = fit_coarse(coarse, trials, registration, fit.plane, every, count, settings, notes)
     if found.base is None or found.machine is None or found.values is None:
         notes.add("coarse runs did not lower the error in cross-validation: the fine runs alone are kept")
-        return found
-    core.modes, core.machine, core.base = every[:, :count], found.machine, found.base
-    core.data.values, choice.modes = found.values, count
-    return found
+        return replace(fit, coarse=found)
+    old, modes = fit.core, np.ascontiguousarray(trials.courses.modes @ every[:, :count])
+    data = Coefficients(old.data.parameters, old.data.time, found.values)
+    core = PodRegression(modes, data, found.machine, "trajectory", old.low, old.high, base=found.base)
+    return replace(
+        fit,
+        core=core,
+        choice=replace(fit.choice, modes=count),
+        coarse=found,
+        held=lambda: _held_over(found, modes, itself=False),
+        itself=lambda: _held_over(found, modes, itself=True),
+    )
+
+
+def from_coarse_run(
+    core: PodRegression,
+    registration: Registration,
+    parameters: NDArray[np.float64],
+    states: NDArray[np.float32],
+    states_time: NDArray[np.float64],
+    time: NDArray[np.float64],
+) -> NDArray[np.float32]:
+    """(state, node, 3), m, at `time` of one run with parameters (1, parameter), from its states (state, coarse node, 3), m."""
+    assert core.base is not None
+    seen, clock, grid = core.base.project(states, core.modes), registration.clock, registration.grid
+    course = (
+        between(seen, states_time, grid) if clock.is_identity else clock.apply(seen, parameters[0], states_time, grid)
+    )
+    out: NDArray[np.float32] = registration.undo(
+        lambda x, t: core.displacement(x, t, coarse=course[None]), parameters, time
+    )[0]
+    return out
 
 
 def _held_over(found: CoarseFit, modes: NDArray[np.float32], *, itself: bool) -> Iterator[Held]:

@@ -1,0 +1,244 @@
+"""What coarse runs beneath few fine ones bring, and from which cost on they pay.
+
+    python benchmarks/multi_fidelity.py fine.zarr coarse.zarr --test 96:108 [--runs 8,12,16,24,48,96]
+        [--coarse-runs 24,48,96,0] [--cost 0.19] [--draws 4] [--set physics.odd=[pole_offset]] [-o table.md]
+
+POD-GPR is trained on some fine runs, drawn at random (several draws where they are few; the number of the draw is its
+seed), alone and with some coarse runs beneath (0: all of them). Coarse runs with the parameters of a test run are never
+among them; they are used for the column "from a coarse run of the query" alone, where each prediction starts from its
+own. Everything is chosen by folds over the fine runs, test runs are asked once. `cost` is what a coarse run costs
+against a fine one: with it the table says how many fine runs alone would have the same error, and below which cost of a
+coarse run it pays to compute them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crashkit.api.campaign import open_campaign
+from crashkit.api.coarse_runs import coarse_runs
+from crashkit.api.source import Source, source_of
+from crashkit.dataset import open_dataset
+from crashkit.selection import runs_of
+from surrogates.data.campaign import Campaign, CoarseRuns, RunByRun
+from surrogates.data.samples import LevelRuns, Notes
+from surrogates.models.coarse_fit import ALONE
+from surrogates.models.pod_regression import PodFit, fit_pod_regression, from_coarse_run, with_coarse
+from surrogates.settings import Settings
+from surrogates.settings import settings as all_settings
+
+# Fine runs from which on draws are fewer: half of them, then one.
+_SOME, _MANY = 16, 48
+
+
+@dataclass
+class Cell:
+    """Errors, m, of one pair of numbers, a value for each draw: on test runs, in folds, from a coarse run of the query."""
+
+    test: list[float] = field(default_factory=list)
+    folds: list[float] = field(default_factory=list)
+    itself: list[float] = field(default_factory=list)
+    ways: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """Some runs of a field (sim, state, node, 3)."""
+
+    values: RunByRun
+    runs: NDArray[np.int64]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return (len(self.runs), *self.values.shape[1:])
+
+    def __getitem__(self, run: int) -> NDArray[np.float32]:
+        out: NDArray[np.float32] = self.values[int(self.runs[run])]
+        return out
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("fine", type=Path)
+    parser.add_argument("coarse", type=Path)
+    parser.add_argument("--test", required=True, help="fine runs that choose nothing, such as 96:108")
+    parser.add_argument("--runs", default="8,12,16,24,48,96", help="numbers of fine runs")
+    parser.add_argument("--coarse-runs", default="24,48,96,0", help="numbers of coarse runs; 0: all")
+    parser.add_argument("--cost", type=float, default=0.19, help="cost of a coarse run against a fine one")
+    parser.add_argument("--draws", type=int, default=4, help="draws of the fewest fine runs")
+    parser.add_argument("--set", action="append", default=[], help="a setting, such as physics.odd=[pole_offset]")
+    parser.add_argument("-o", "--output", type=Path, help="where the table goes as Markdown; default: the terminal")
+    options = parser.parse_args(arguments)
+    counts, below = ([int(n) for n in text.split(",")] for text in (options.runs, options.coarse_runs))
+    settings = all_settings("pod-gpr", None, None, [options.set])
+    bench = Bench(source_of(options.fine), source_of(options.coarse), options.test, settings)
+    total = len(bench.coarse.campaign.parameters)
+    below = sorted({min(number or total, total) for number in below})
+    found: dict[tuple[int, int | None], Cell] = {}
+    for count in counts:
+        for draw in range(draws(count, options.draws)):
+            for key, said in bench.row(count, below, draw):
+                cell = found.setdefault(key, Cell())
+                for name, value in said.items():
+                    getattr(cell, name).append(value)
+            lines = list(tables(found, options.cost))
+            if options.output:  # what is known so far is kept, whatever happens
+                options.output.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    print("\n".join(tables(found, options.cost)))
+
+
+def draws(count: int, most: int) -> int:
+    """How many draws of so many fine runs: the fewer runs, the more."""
+    return most if count < _SOME else max(1, most // 2) if count < _MANY else 1
+
+
+class Bench:
+    """Fine and coarse runs, and the test runs with their coarse runs."""
+
+    def __init__(self, fine: Source, coarse: Source, test: str, settings: Settings) -> None:
+        self.settings = settings
+        self.campaign = open_campaign(fine, test, symmetry=True, odd=settings.physics.odd or ())
+        self.coarse = coarse_runs(coarse.path or coarse.name, self.campaign, fine)
+        with open_dataset(fine.name) as opened:
+            place = runs_of([str(n) for n in opened["sim"].values], test)
+            tested = opened.isel(sim=place)
+            self.parameters = np.stack([tested[n].values for n in self.campaign.parameter_names], axis=1).astype(float)
+            self.truth = [tested["displacement"].isel(sim=k).values for k in range(len(place))]
+        self.own = self._coarse_of_queries(coarse)
+
+    def _coarse_of_queries(self, coarse: Source) -> list[NDArray[np.float32] | None]:
+        """Displacements of the coarse run of each test run; None without one."""
+        every = open_campaign(coarse)
+        order = [every.parameter_names.index(n) for n in self.campaign.parameter_names]
+        runs = LevelRuns(every, 0, self.settings, Notes())
+        out: list[NDArray[np.float32] | None] = []
+        for one in self.parameters:
+            same = np.flatnonzero(np.isclose(every.parameters[:, order], one, rtol=1e-6).all(axis=1))
+            out.append(runs.read(int(same[0])) if len(same) else None)
+        return out
+
+    def row(
+        self, count: int, below: Sequence[int], draw: int
+    ) -> Iterable[tuple[tuple[int, int | None], dict[str, float | str]]]:
+        """Errors of `count` fine runs alone, and with each number of coarse runs."""
+        started, notes = time.perf_counter(), Notes()
+        order = np.random.default_rng(draw).permutation(len(self.campaign.parameters))
+        chosen = np.sort(order[:count])
+        campaign = some_runs(self.campaign, chosen)
+        alone = fit_pod_regression(campaign, self.settings, np.arange(count), notes)
+        error = float(np.nanmean([self._error(self._said(alone, one), k) for k, one in enumerate(self.parameters)]))
+        judged = None
+        rest = np.random.default_rng(1000 + draw).permutation(len(self.coarse.campaign.parameters))
+        print(
+            f"{count} fine runs, draw {draw}: {1e3 * error:.2f} mm ({time.perf_counter() - started:.0f} s)", flush=True
+        )
+        for number in below:
+            runs = np.sort(rest[:number])
+            with_them = with_coarse(alone, self._some_coarse(runs), self.settings, Notes())
+            assert with_them.coarse is not None
+            folds, way = with_them.coarse.errors, with_them.coarse.way
+            judged = folds.get(ALONE) if judged is None else judged
+            test = float(
+                np.nanmean([self._error(self._said(with_them, one), k) for k, one in enumerate(self.parameters)])
+            )
+            itself = float(np.nanmean([self._from_itself(with_them, k) for k in range(len(self.parameters))]))
+            print(f"  {len(runs)} coarse: {1e3 * test:.2f} mm, from itself {1e3 * itself:.2f} ({way})", flush=True)
+            yield (count, number), {"test": test, "folds": folds.get(way, np.nan), "itself": itself, "ways": way}
+        yield (
+            (count, None),
+            {"test": error, "folds": np.nan if judged is None else judged, "itself": error, "ways": ALONE},
+        )
+
+    def _some_coarse(self, runs: NDArray[np.int64]) -> CoarseRuns:
+        return CoarseRuns(some_runs(self.coarse.campaign, runs), self.coarse.to_fine)
+
+    def _said(self, fit: PodFit, one: NDArray[np.float64]) -> NDArray[np.float32]:
+        out: NDArray[np.float32] = fit.registration.undo(fit.core.displacement, one[None], self.campaign.time)[0]
+        return out
+
+    def _from_itself(self, fit: PodFit, k: int) -> float:
+        """The error of a test run, from its own coarse run where there is one and the model takes it."""
+        seen, one = self.own[k], self.parameters[k]
+        if seen is None or fit.core.base is None:
+            return self._error(self._said(fit, one), k)
+        time = self.coarse.campaign.time
+        return self._error(from_coarse_run(fit.core, fit.registration, one[None], seen, time, self.campaign.time), k)
+
+    def _error(self, said: NDArray[np.float32], k: int) -> float:
+        return float(np.nanmean(np.linalg.norm(said - self.truth[k], axis=-1)))
+
+
+def some_runs(campaign: Campaign, runs: NDArray[np.int64]) -> Campaign:
+    """The runs `runs` of `campaign`, on the full mesh."""
+    values = campaign.displacement(0)
+    return replace(
+        campaign, parameters=campaign.parameters[runs], runs=tuple(campaign.runs[k] for k in runs),
+        displacement=lambda level: Chosen(values, runs), marked={}, targets=(), curves=(), alive=None,
+    )  # fmt: skip
+
+
+def tables(found: dict[tuple[int, int | None], Cell], cost: float) -> Iterable[str]:
+    """Markdown: errors, then costs."""
+    counts = sorted({count for count, _ in found})
+    below = list(dict.fromkeys(number for _, number in found if number is not None))
+    alone = {count: float(np.mean(found[count, None].test)) for count in counts if (count, None) in found}
+    for title, part in (
+        ("Error on test runs, mm", "test"),
+        ("Error in cross-validation over the fine runs, mm", "folds"),
+        ("Error on test runs, mm, from a coarse run of the query", "itself"),
+    ):
+        yield f"{title}:"
+        yield ""
+        yield "| fine runs | draws | alone | " + " | ".join(f"with {n} coarse" for n in below) + " |"
+        yield "|---|---|---|" + "---|" * len(below)
+        for count in alone:
+            base = float(np.mean(getattr(found[count, None], part)))
+            row = [f"{1e3 * base:.2f}"]
+            for number in below:
+                mean = float(np.mean(getattr(found[count, number], part)))
+                row.append(f"{1e3 * mean:.2f} ({100 * (1 - mean / base):.0f} %)")
+            yield f"| {count} | {len(found[count, None].test)} | " + " | ".join(row) + " |"
+        yield ""
+    yield "How many fine runs alone have the same error, and below which cost of a coarse run against a fine one it pays"
+    yield f"to compute them instead of further fine runs (here a coarse run costs {cost:g}):"
+    yield ""
+    yield "| fine runs | " + " | ".join(f"with {n} coarse" for n in below) + " |"
+    yield "|---|" + "---|" * len(below)
+    for count in alone:
+        cells = []
+        for number in below:
+            same = same_error(alone, float(np.mean(found[count, number].test)))
+            cells.append("-" if same is None else f"{same:.0f} runs, below {max(0.0, same - count) / number:.2f}")
+        yield f"| {count} | " + " | ".join(cells) + " |"
+    yield ""
+    yield "How they are used (number of draws): " + told_ways(found)
+
+
+def same_error(alone: dict[int, float], error: float) -> float | None:
+    """The number of fine runs with that error, by straight lines between logarithms; None beyond the numbers tried."""
+    counts = np.array(sorted(alone))
+    errors = np.minimum.accumulate([alone[int(n)] for n in counts])
+    if len(counts) < 2 or not errors[-1] <= error <= errors[0]:
+        return None
+    return float(np.exp(np.interp(-np.log(error), -np.log(errors), np.log(counts))))
+
+
+def told_ways(found: dict[tuple[int, int | None], Cell]) -> str:
+    """How often each way was chosen, by number of fine runs."""
+    out = []
+    for count in sorted({count for count, _ in found}):
+        ways = [way for (n, number), cell in found.items() if n == count and number is not None for way in cell.ways]
+        names = sorted(set(ways), key=ways.count, reverse=True)
+        out.append(f"{count} fine runs: " + ", ".join(f"{name} {ways.count(name)}" for name in names))
+    return "; ".join(out) + "."
+
+
+if __name__ == "__main__":
+    main()
