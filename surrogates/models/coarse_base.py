@@ -1,8 +1,9 @@
 """What runs on a coarser mesh add to a regression of fine ones.
 
-A prediction is w(x)' (F - s T C) + s c(x): the fine process's weights w of the fine courses F, and what the coarse field
-c at the query says beyond the coarse fields T C at the parameters of the fine runs, taken over with a slope s for each
-mode. c is a process over all coarse runs, or a coarse run of the query itself.
+A prediction is w(x)' (F - s B) + s c(x): the fine process's weights w of the fine courses F, and what the coarse field c
+at the query says beyond the coarse fields B at the parameters of the fine runs, taken over with a slope s for each mode.
+c is a process over all coarse runs, or a coarse run of the query itself. A mean of several such predictions is another
+sum of weighted courses.
 """
 
 from __future__ import annotations
@@ -36,7 +37,19 @@ class CoarseBase:
         The coarse mesh (coarse node, 3), m, and the solver's numbers on it: a coarse run must have them.
     share
         How much a coarse run of the query counts; the process counts by the rest.
+    beside
+        A second process over the fine runs and images, with other lengths, and its courses; None without.
     """
+
+    def weights(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(run, sample): how much each of the `courses` enters at scaled inputs (run, input)."""
+        own = self.process.weights(x)
+        return own if self.beside is None else np.concatenate([self.beside[0].weights(x), own], axis=1)
+
+    @property
+    def courses(self) -> NDArray[np.float32]:
+        """(sample, state of the grid, mode), m."""
+        return self.values if self.beside is None else np.concatenate([self.beside[1], self.values])
 
     process: Gaussian
     values: NDArray[np.float32]
@@ -45,6 +58,7 @@ class CoarseBase:
     position: NDArray[np.float64]
     node_id: NDArray[np.int64]
     share: float = 1.0
+    beside: tuple[Gaussian, NDArray[np.float32]] | None = None
 
     def project(self, states: NDArray[np.float32], modes: NDArray[np.float32]) -> NDArray[np.float64]:
         """Coarse displacements (state, coarse node, 3), m -> what is taken over of their coefficients (state, mode)."""
@@ -53,7 +67,12 @@ class CoarseBase:
     def arrays(self) -> dict[str, NDArray[Any]]:
         """What has to be stored."""
         u = self.to_fine
-        return {
+        beside: dict[str, NDArray[Any]] = {}
+        if self.beside is not None:
+            machine, values = self.beside
+            numbers = machine.numbers()
+            beside = {"beside.x": machine.x, "beside.values": values, **{f"beside.{k}": v for k, v in numbers.items()}}
+        return beside | {
             "x": self.process.x, **self.process.numbers(), "values": self.values, "slopes": self.slopes,
             "data": u.data, "indices": u.indices.astype(np.int32), "indptr": u.indptr.astype(np.int64),
             "position": self.position, "node_id": self.node_id, "share": np.array([self.share]),
@@ -65,7 +84,12 @@ class CoarseBase:
         shape = (len(a["indptr"]) - 1, len(a["position"]))
         to_fine = sparse.csr_matrix((a["data"], a["indices"], a["indptr"]), shape=shape)
         process = Gaussian.load(a["x"], a)
-        return cls(process, a["values"], a["slopes"], to_fine, a["position"], a["node_id"], float(a["share"][0]))
+        beside = None
+        if "beside.x" in a:
+            numbers = {k: a[f"beside.{k}"] for k in process.numbers()}
+            beside = Gaussian.load(a["beside.x"], numbers), a["beside.values"]
+        share = float(a["share"][0])
+        return cls(process, a["values"], a["slopes"], to_fine, a["position"], a["node_id"], share, beside)
 
 
 def coarse_modes(to_fine: sparse.csr_matrix, modes: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -1,10 +1,11 @@
 """How coarse runs are put beneath fine ones, chosen by folds over the fine training runs.
 
-Three ways are compared with the fine runs alone. In two of them the fine process keeps its weights, and a slope from 0 to
-1.2 for each mode says how much of the coarse field is taken over: with the lengths that the fine runs themselves
-suggest, or with those of the coarse process, which has seen more runs. The third is a process over the differences of
-fine and coarse courses. A fold is judged with slopes that were fitted on the other folds, and by a coarse process
-without the coarse runs of the parameters that are left out: a query has no coarse run of its own.
+What the coarse field says beyond the coarse fields at the fine runs' parameters is taken over with a slope for each mode,
+from 0 to 1.2; one that few runs tell is drawn to that of all modes. The fine runs' weights have the lengths that these
+suggest, or those of the differences of fine and coarse courses, which change more slowly with the parameters. A process
+over the differences has all slopes one. With few runs folds cannot tell which of the three is best, and their mean is
+better than each. A fold is judged with slopes that were fitted on the other folds, and by a coarse process without the
+coarse runs of the parameters that are left out: a query has no coarse run of its own.
 """
 
 from __future__ import annotations
@@ -29,15 +30,11 @@ from surrogates.settings import Settings
 
 _log = logging.getLogger(__name__)
 
-ALONE, OWN, LENGTHS, DIFFERENCES = (
-    "fine runs alone",
-    "slopes",
-    "slopes, lengths of the coarse runs",
-    "process over the differences",
-)
+ALONE, OWN = "fine runs alone", "slopes, lengths of the fine runs"
+LENGTHS, DIFFERENCES, MEAN = "slopes, lengths of the differences", "process over the differences", "mean of the three"
 EVERYWHERE, OF_QUERY = "with a coarse run of the query among them", "from a coarse run of the query"
-# Largest slope, and its ridge as a share of the mean square over the modes.
-_STEEPEST, _RIDGE = 1.2, 0.01
+# Largest slope, and how strongly slopes are drawn to that of all modes, as a share of the mean square over the modes.
+_STEEPEST, _RIDGE = 1.2, 1.0
 # Coarse runs are kept if they lower the error by this share, and by so many standard errors of the mean over runs.
 _WORTH_IT, _SURE = 0.01, 1.0
 # How much a coarse run of the query counts beside the coarse process.
@@ -57,7 +54,7 @@ class CoarseFit:
     Attributes
     ----------
     way
-        What was best: one of ALONE, OWN, LENGTHS, DIFFERENCES.
+        What is kept: MEAN, OWN or ALONE, the first that folds do not reject.
     errors
         E2, m, over left-out fine runs of each way, and of the best one where the coarse runs hold the query itself.
     runs, twins
@@ -83,17 +80,36 @@ class CoarseFit:
 class _Fold:
     """What one fold says of its left-out runs, as registered courses (run, state, mode).
 
-    alone, beneath  weighted sums of the fine courses, and of the coarse ones at their parameters
+    alone, beneath  weighted sums of the fine courses, and of the coarse ones at their parameters, by each kind of lengths
     far, near       the coarse process without and with the coarse runs of the left-out parameters
     deviation       (run,) of the fine process
     """
 
     held: NDArray[np.int64]
-    alone: Courses3
-    beneath: Courses3
+    alone: tuple[Courses3, Courses3]
+    beneath: tuple[Courses3, Courses3]
     far: Courses3
     near: Courses3
     deviation: NDArray[np.float64]
+
+    def over(self, way: str, slopes: Slopes, coarse: Courses3) -> Courses3:
+        """The fine runs alone, and what the `coarse` field adds."""
+        out = np.zeros_like(coarse)
+        for kind, share, fitted in _TERMS[way]:
+            taken = slopes[kind] if fitted else np.ones(coarse.shape[2])
+            out += share * (self.alone[kind] + taken * (coarse - self.beneath[kind])).astype(np.float32)
+        return out
+
+
+# Slopes (mode,) by kind of lengths.
+Slopes = tuple[NDArray[np.float64], NDArray[np.float64]]
+# Of each way its terms: kind of lengths (of the fine runs, of the differences), share, whether slopes are fitted.
+_TERMS: dict[str, list[tuple[int, float, bool]]] = {
+    OWN: [(0, 1.0, True)],
+    LENGTHS: [(1, 1.0, True)],
+    DIFFERENCES: [(1, 1.0, False)],
+    MEAN: [(0, 1 / 3, True), (1, 1 / 3, True), (1, 1 / 3, False)],
+}
 
 
 def fit_coarse(
@@ -163,47 +179,44 @@ class _Search:
         if len(self.trials.folds.judged) < _FEWEST:
             return CoarseFit(ALONE, {}, self.count, twins)
         own = self._fitted(self._scaled(self.inputs), self.fine)
-        lengths = _with_lengths(own.kernel, self.process.kernel)
-        ones = np.ones(self.fine.shape[2])
-        folds = {OWN: list(self._folds(own.kernel, refit=True))}
-        if len(self.process.kernel.mix) == len(own.kernel.mix):
-            folds[LENGTHS] = list(self._folds(lengths))
-        folds[DIFFERENCES] = list(self._folds(own.kernel, self.fine - self.at_fine, refit=True))
-        errors = {ALONE: self._errors(folds[OWN], lambda fold, slope: fold.alone)}
-        for way, found in folds.items():
-            fixed = ones if way == DIFFERENCES else None
-            errors[way] = self._errors(found, lambda fold, slope: _over(fold, fold.far, slope), fixed)
-        way = min(folds, key=lambda w: float(np.nanmean(errors[w])))
+        apart = self._fitted(own.x, self.fine - self.at_fine, own.kernel)
+        folds = list(self._across(list(self._folds(own.kernel, apart.kernel))))
+        errors = {ALONE: self._errors(folds, lambda fold, slopes: fold.alone[0])}
+        for way in _TERMS:
+            errors[way] = self._errors(folds, _farther(way))
         told = {name: float(np.nanmean(e)) for name, e in errors.items()}
-        if not _clearly(errors[ALONE], errors[way]):
+        way = next((w for w in (MEAN, OWN) if _clearly(errors[ALONE], errors[w])), ALONE)
+        _log.info("coarse runs: %s", way)
+        if way == ALONE:
             return CoarseFit(ALONE, told, self.count, twins)
-        fixed = ones if way == DIFFERENCES else None
-        found = folds[way]
-        near = self._errors(found, lambda fold, slope: _over(fold, fold.near, slope), fixed)
-        told[EVERYWHERE] = float(np.nanmean(near))
+        told[EVERYWHERE] = float(
+            np.nanmean(self._errors(folds, lambda fold, slopes: fold.over(way, slopes, fold.near)))
+        )
         share = 1.0
         if twins:
-            by_share = {}
-            for share in _SHARES:
-                itself = self._errors(found, self._from_itself(share), fixed)
-                by_share[share] = float(itself[self.twin >= 0].mean())
-            share = min(by_share, key=lambda tried: by_share[tried])
-            told[OF_QUERY] = by_share[share]
-        slopes = ones if fixed is not None else _slopes(np.sum([self._sums(fold) for fold in found], axis=0))
-        values = self.fine - (slopes * self.at_fine).astype(np.float32)
-        machine = own
-        if way == LENGTHS:
-            machine = Gaussian(own.x, lengths, own.mixed)
-        elif way == DIFFERENCES:
-            machine = self._fitted(own.x, values, own.kernel)
-        _log.info("coarse runs: %s", way)
-        base = CoarseBase(
-            self.process, np.ascontiguousarray((slopes * self.below)[..., :count], np.float32), slopes[:count].copy(),
-            self.coarse.to_fine, *_labelled(self.coarse), share,
-        )  # fmt: skip
-        values = np.ascontiguousarray(values[..., :count])
-        held = list(self._held(found, fixed, count, share))
-        return CoarseFit(way, told, self.count, twins, machine, values, base, held)
+            of_share = {s: self._errors(folds, self._from_itself(way, s))[self.twin >= 0].mean() for s in _SHARES}
+            share = min(of_share, key=lambda tried: float(of_share[tried]))
+            told[OF_QUERY] = float(of_share[share])
+        slopes = _both(_sum_of([sums for _, sums, _ in folds]))
+        base, values = self._base(way, slopes, apart, count, share)
+        held = [one for fold, _, fitted in folds for one in self._held(fold, way, fitted, count, share)]
+        return CoarseFit(way, told, self.count, twins, own, values, base, held)
+
+    def _base(self, way: str, slopes: Slopes, apart: Gaussian, count: int, share: float) -> tuple[CoarseBase, Courses3]:
+        """What coarse runs add, and the courses that they leave to the process with the lengths of the fine runs."""
+        left = [np.zeros_like(self.fine), np.zeros_like(self.fine)]
+        total = np.zeros(self.fine.shape[2])
+        for kind, part, fitted in _TERMS[way]:
+            taken = slopes[kind] if fitted else np.ones(len(total))
+            left[kind] += part * (self.fine - taken * self.at_fine).astype(np.float32)
+            total += part * taken
+        kept = [np.ascontiguousarray(courses[..., :count]) for courses in left]
+        beside = (apart, kept[1]) if any(kind for kind, _, _ in _TERMS[way]) else None
+        below = np.ascontiguousarray((total * self.below)[..., :count], np.float32)
+        where = _labelled(self.coarse)
+        return CoarseBase(self.process, below, total[:count].copy(), self.coarse.to_fine, *where, share, beside), kept[
+            0
+        ]
 
     def _registered(
         self, courses: list[Courses3], parameters: NDArray[np.float64], keep: NDArray[np.int64]
@@ -234,68 +247,60 @@ class _Search:
             out[len(self.twin) + runs] = self.below[self.count + self.twin[runs]]
         return out
 
-    def _folds(self, kernel: Kernel, values: Courses3 | None = None, *, refit: bool = False) -> Iterator[_Fold]:
-        """What each fold says; its process has `kernel`, or starts from it and is fitted to the runs that train."""
-        courses = self.fine if values is None else values
+    def _folds(self, own: Kernel, apart: Kernel) -> Iterator[_Fold]:
+        """What each fold says; the kernels of its processes start from those of all runs."""
         inputs = self._scaled(self.inputs)
         for train, held in self.trials.folds:
             if not len(held):
                 continue
             part = self.trials.with_images(self.of, train)
-            machine = self._fitted(inputs[part], courses[part], kernel) if refit else Gaussian(inputs[part], kernel)
-            weights = machine.weights(inputs[held])
+            fine, coarse = self.fine[part], self.at_fine[part]
+            machines = self._fitted(inputs[part], fine, own), self._fitted(inputs[part], fine - coarse, apart)
+            weights = [machine.weights(inputs[held]) for machine in machines]
             twins = self.twin[held]
             gone = twins[twins >= 0]
             left = np.setdiff1d(np.arange(len(self.x)), np.concatenate([gone, gone + self.count]))
             far = Gaussian(self.x[left], self.process.kernel).weights(inputs[held])
             yield _Fold(
-                held, _weighted(weights, self.fine[part]), _weighted(weights, self.at_fine[part]),
-                _weighted(far, self.below[left]), _weighted(self.process.weights(inputs[held]), self.below),
-                machine.deviation(inputs[held]),
+                held, (_weighted(weights[0], fine), _weighted(weights[1], fine)),
+                (_weighted(weights[0], coarse), _weighted(weights[1], coarse)), _weighted(far, self.below[left]),
+                _weighted(self.process.weights(inputs[held]), self.below), machines[0].deviation(inputs[held]),
             )  # fmt: skip
 
     def _sums(self, fold: _Fold) -> NDArray[np.float64]:
-        """(2, mode): products of what fine runs alone miss and what the coarse field adds, and squares of the latter."""
+        """(kind of lengths, 2, mode): products of what fine runs miss and what the coarse field adds, and its squares."""
         parameters, time = self.trials.parameters[fold.held], self.trials.courses.time
         size = self.of.clock.size(parameters)[:, None, None]
-        known = self.of.clock.known(parameters, time, self.of.grid)[:, :, None]
-        missed = size * (self.fine[fold.held] - fold.alone)
-        added = size * (self.at_fine[fold.held] - fold.beneath)
-        return np.stack([(missed * added * known).sum(axis=(0, 1)), (added * added * known).sum(axis=(0, 1))])
+        known = size * self.of.clock.known(parameters, time, self.of.grid)[:, :, None]
+        out = []
+        for alone, beneath in zip(fold.alone, fold.beneath, strict=True):
+            missed, added = known * (self.fine[fold.held] - alone), known * (self.at_fine[fold.held] - beneath)
+            out.append([(missed * added).sum(axis=(0, 1)), (added * added).sum(axis=(0, 1))])
+        return np.array(out)
 
-    def _across(
-        self, folds: list[_Fold], fixed: NDArray[np.float64] | None
-    ) -> Iterator[tuple[_Fold, NDArray[np.float64]]]:
-        """Each fold, and slopes that were fitted without its runs."""
-        sums = [] if fixed is not None else [self._sums(fold) for fold in folds]
-        for fold in folds:
-            if fixed is not None:
-                yield fold, fixed
-                continue
+    def _across(self, folds: list[_Fold]) -> Iterator[_Judged]:
+        """Each fold, its sums, and slopes that were fitted without its runs."""
+        sums = [self._sums(fold) for fold in folds]
+        for fold, own in zip(folds, sums, strict=True):
             others = [s for f, s in zip(folds, sums, strict=True) if not np.intersect1d(f.held, fold.held).size]
-            yield fold, _slopes(np.sum(others, axis=0))
+            yield fold, own, _both(_sum_of(others or sums))  # runs named for validation are one fold alone
 
-    def _errors(
-        self,
-        folds: list[_Fold],
-        said: Callable[[_Fold, NDArray[np.float64]], Courses3],
-        fixed: NDArray[np.float64] | None = None,
-    ) -> NDArray[np.float64]:
+    def _errors(self, folds: list[_Judged], said: Callable[[_Fold, Slopes], Courses3]) -> NDArray[np.float64]:
         """(run,) e2, m; NaN for runs that are never left out."""
         runs = len(self.trials.parameters)
         total, rounds = np.zeros(runs), np.zeros(runs)
-        for fold, slopes in self._across(folds, fixed):
+        for fold, _, slopes in folds:
             courses = self._undone(said(fold, slopes), fold.held) @ self.turn.T
             total[fold.held] += self.trials.distances(fold.held, courses)
             rounds[fold.held] += 1
         return np.where(rounds > 0, total / np.maximum(rounds, 1), np.nan)
 
-    def _from_itself(self, share: float) -> Callable[[_Fold, NDArray[np.float64]], Courses3]:
+    def _from_itself(self, way: str, share: float) -> Callable[[_Fold, Slopes], Courses3]:
         """What is said from the coarse run of each left-out run, which counts by `share`, and the process by the rest."""
 
-        def said(fold: _Fold, slopes: NDArray[np.float64]) -> Courses3:
+        def said(fold: _Fold, slopes: Slopes) -> Courses3:
             own = self.at_fine[fold.held]
-            return _over(fold, np.float32(share) * own + np.float32(1 - share) * fold.far, slopes)
+            return fold.over(way, slopes, np.float32(share) * own + np.float32(1 - share) * fold.far)
 
         return said
 
@@ -308,13 +313,21 @@ class _Search:
         return np.stack(out)
 
     def _held(
-        self, folds: list[_Fold], fixed: NDArray[np.float64] | None, count: int, share: float
+        self, fold: _Fold, way: str, slopes: Slopes, count: int, share: float
     ) -> Iterator[tuple[int, Courses3, Courses3 | None, float]]:
-        for fold, slopes in self._across(folds, fixed):
-            far = self._undone(_over(fold, fold.far, slopes), fold.held)[..., :count]
-            itself = self._undone(self._from_itself(share)(fold, slopes), fold.held)[..., :count]
-            for k, run in enumerate(fold.held):
-                yield int(run), far[k], itself[k] if self.twin[run] >= 0 else None, float(fold.deviation[k])
+        far = self._undone(fold.over(way, slopes, fold.far), fold.held)[..., :count]
+        itself = self._undone(self._from_itself(way, share)(fold, slopes), fold.held)[..., :count]
+        for k, run in enumerate(fold.held):
+            yield int(run), far[k], itself[k] if self.twin[run] >= 0 else None, float(fold.deviation[k])
+
+
+# A fold, its sums (kind of lengths, 2, mode), and slopes from the other folds.
+_Judged = tuple[_Fold, NDArray[np.float64], Slopes]
+
+
+def _farther(way: str) -> Callable[[_Fold, Slopes], Courses3]:
+    """What is said of runs without a coarse run of their own."""
+    return lambda fold, slopes: fold.over(way, slopes, fold.far)
 
 
 def _coefficients(
@@ -355,20 +368,21 @@ def _twins(fine: NDArray[np.float64], coarse: NDArray[np.float64]) -> NDArray[np
     return np.where(apart.min(axis=1) <= _SAME, apart.argmin(axis=1), -1)
 
 
-def _with_lengths(own: Kernel, other: Kernel) -> Kernel:
-    """`other` with the noise of `own`."""
-    return Kernel(other.variance, other.slope, own.noise, other.mix)
+def _sum_of(sums: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """The sum over folds."""
+    return np.asarray(np.sum(sums, axis=0))
 
 
-def _over(fold: _Fold, coarse: Courses3, slopes: NDArray[np.float64]) -> Courses3:
-    """The fine runs alone, and what the coarse field adds."""
-    return np.asarray(fold.alone + slopes * (coarse - fold.beneath), np.float32)
+def _both(sums: NDArray[np.float64]) -> Slopes:
+    return _slopes(sums[0]), _slopes(sums[1])
 
 
 def _slopes(sums: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(mode,) from products and squares (2, mode): least squares with a small ridge, within bounds."""
+    """(mode,) from products and squares (2, mode): least squares drawn to the slope of all modes, within bounds."""
     product, square = sums
-    return np.asarray(np.clip(product / np.maximum(square + _RIDGE * square.mean(), 1e-300), 0.0, _STEEPEST))
+    pull = _RIDGE * max(float(square.mean()), 1e-300)
+    every = product.sum() / max(float(square.sum()), 1e-300)
+    return np.asarray(np.clip((product + pull * every) / (square + pull), 0.0, _STEEPEST))
 
 
 def _weighted(weights: NDArray[np.float64], values: Courses3) -> Courses3:

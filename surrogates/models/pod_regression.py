@@ -100,6 +100,8 @@ class PodRegression:
         if self.inputs == "trajectory":
             course = _summed(self.machine.weights(x), self.data.values)
             if self.base is not None:
+                if self.base.beside is not None:
+                    course += _summed(self.base.beside[0].weights(x), self.base.beside[1])
                 beneath = _summed(self.base.process.weights(x), self.base.values)
                 course += beneath if coarse is None else beneath + self.base.share * (coarse - beneath)
             return _at(course, self.data.time, time)
@@ -114,12 +116,12 @@ class PodRegression:
         """(run, p) -> (run, training sample): how much each of the `courses` enters, where a run is one sample."""
         x = self.scaled(parameters)
         own = self.machine.weights(x)
-        return own if self.base is None else np.concatenate([own, self.base.process.weights(x)], axis=1)
+        return own if self.base is None else np.concatenate([own, self.base.weights(x)], axis=1)
 
     @property
     def courses(self) -> NDArray[np.float32]:
         """(training sample, state, mode), m: fine runs, then coarse ones."""
-        return self.data.values if self.base is None else np.concatenate([self.data.values, self.base.values])
+        return self.data.values if self.base is None else np.concatenate([self.data.values, self.base.courses])
 
     def deviation(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
         """(run, p) -> (run,): what the process believes its error to be, up to a factor; ones where it believes nothing."""

@@ -194,6 +194,9 @@ def check_base(base: CoarseBase | None, graphs: Graphs) -> None:
     samples = len(numbers("inputs of the coarse runs", base.process.x, (None, None)))
     slopes = numbers("slopes of the coarse runs", base.slopes, (None,))
     numbers("values of the coarse runs", base.values, (samples, None, len(slopes)))
+    if base.beside is not None:
+        fine = len(numbers("inputs beside the coarse runs", base.beside[0].x, (None, None)))
+        numbers("values beside the coarse runs", base.beside[1], (fine, base.values.shape[1], len(slopes)))
     nodes = len(numbers("position of the coarse mesh", base.position, (None, 3)))
     numbers("node_id of the coarse mesh", base.node_id, (nodes,))
     whole_matrix("the map from the coarse mesh", base.to_fine)

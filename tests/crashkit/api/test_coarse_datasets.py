@@ -104,7 +104,8 @@ def test_a_prediction_starts_from_a_run_of_a_dataset(model: Model, tmp_path: Pat
     true = dataset(9, range(71, 72))["displacement"].values[0]
     alone = model.predict(at(71))["displacement"].values
     error = np.linalg.norm(said["displacement"].values - true, axis=-1).mean()
-    assert error < np.linalg.norm(alone - true, axis=-1).mean()
+    assert error < 0.01 * np.linalg.norm(true, axis=-1).mean()
+    assert np.abs(alone - said["displacement"].values).max() > 0  # another way to say it
     assert (said["half_width"].values >= 0).all()
 
 
