@@ -1,7 +1,8 @@
 """What coarse runs beneath few fine ones bring, and from which cost on they pay.
 
     python benchmarks/multi_fidelity.py fine.zarr coarse.zarr --test 96:108 [--runs 8,12,16,24,48,96]
-        [--coarse-runs 24,48,96,0] [--cost 0.19] [--draws 4] [--set physics.odd=[pole_offset]] [-o table.md]
+        [--coarse-runs 24,48,96,0] [--cost 0.19] [--draws 4] [--set physics.odd=[pole_offset]] [--keep rows/]
+        [-o table.md]
 
 POD-GPR is trained on some fine runs, drawn at random (several draws where they are few; the number of the draw is its
 seed), alone and with some coarse runs beneath (0: all of them). Coarse runs with the parameters of a test run are never
@@ -14,8 +15,9 @@ coarse run it pays to compute them.
 from __future__ import annotations
 
 import argparse
+import json
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -74,6 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--cost", type=float, default=0.19, help="cost of a coarse run against a fine one")
     parser.add_argument("--draws", type=int, default=4, help="draws of the fewest fine runs")
     parser.add_argument("--set", action="append", default=[], help="a setting, such as physics.odd=[pole_offset]")
+    parser.add_argument("--keep", type=Path, help="folder where finished draws are kept, and not computed again")
     parser.add_argument("-o", "--output", type=Path, help="where the table goes as Markdown; default: the terminal")
     options = parser.parse_args(arguments)
     counts, below = ([int(n) for n in text.split(",")] for text in (options.runs, options.coarse_runs))
@@ -84,14 +87,29 @@ def main(arguments: Sequence[str] | None = None) -> None:
     found: dict[tuple[int, int | None], Cell] = {}
     for count in counts:
         for draw in range(draws(count, options.draws)):
-            for key, said in bench.row(count, below, draw):
-                cell = found.setdefault(key, Cell())
+            for number, said in kept(options.keep, count, draw, lambda c=count, d=draw: bench.row(c, below, d)):
+                cell = found.setdefault((count, number), Cell())
                 for name, value in said.items():
                     getattr(cell, name).append(value)
             lines = list(tables(found, options.cost))
             if options.output:  # what is known so far is kept, whatever happens
                 options.output.write_text("\n".join(lines) + "\n", encoding="utf-8")
     print("\n".join(tables(found, options.cost)))
+
+
+Row = Iterable[tuple[int | None, dict[str, float | str]]]
+
+
+def kept(folder: Path | None, count: int, draw: int, row: Callable[[], Row]) -> Row:
+    """What one draw said, from `folder` where it is there."""
+    file = None if folder is None else folder / f"{count}_{draw}.json"
+    if file is not None and file.exists():
+        return [(number, said) for number, said in json.loads(file.read_text(encoding="utf-8"))]
+    out = list(row())
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps(out), encoding="utf-8")
+    return out
 
 
 def draws(count: int, most: int) -> int:
@@ -124,9 +142,7 @@ class Bench:
             out.append(runs.read(int(same[0])) if len(same) else None)
         return out
 
-    def row(
-        self, count: int, below: Sequence[int], draw: int
-    ) -> Iterable[tuple[tuple[int, int | None], dict[str, float | str]]]:
+    def row(self, count: int, below: Sequence[int], draw: int) -> Row:
         """Errors of `count` fine runs alone, and with each number of coarse runs."""
         started, notes = time.perf_counter(), Notes()
         order = np.random.default_rng(draw).permutation(len(self.campaign.parameters))
@@ -150,9 +166,9 @@ class Bench:
             )
             itself = float(np.nanmean([self._from_itself(with_them, k) for k in range(len(self.parameters))]))
             print(f"  {len(runs)} coarse: {1e3 * test:.2f} mm, from itself {1e3 * itself:.2f} ({way})", flush=True)
-            yield (count, number), {"test": test, "folds": folds.get(way, np.nan), "itself": itself, "ways": way}
+            yield number, {"test": test, "folds": folds.get(way, np.nan), "itself": itself, "ways": way}
         yield (
-            (count, None),
+            None,
             {"test": error, "folds": np.nan if judged is None else judged, "itself": error, "ways": ALONE},
         )
 

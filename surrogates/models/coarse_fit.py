@@ -39,6 +39,8 @@ _STEEPEST, _RIDGE = 1.2, 1.0
 _WORTH_IT, _SURE = 0.01, 1.0
 # How much a coarse run of the query counts beside the coarse process.
 _SHARES = (1.0, 0.75, 0.5, 0.25)
+# Its share where fewer fine runs than this have a coarse run by which it could be chosen.
+_TWINS, _UNKNOWN = 6, 0.5
 # Share of the range within which two parameters are the same.
 _SAME = 1e-6
 # Fewer fine runs choose no slopes, fewer coarse ones give no process.
@@ -192,8 +194,8 @@ class _Search:
         told[EVERYWHERE] = float(
             np.nanmean(self._errors(folds, lambda fold, slopes: fold.over(way, slopes, fold.near)))
         )
-        share = 1.0
-        if twins:
+        share = _UNKNOWN
+        if twins >= _TWINS:
             of_share = {s: self._errors(folds, self._from_itself(way, s))[self.twin >= 0].mean() for s in _SHARES}
             share = min(of_share, key=lambda tried: float(of_share[tried]))
             told[OF_QUERY] = float(of_share[share])
