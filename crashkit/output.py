@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from crashkit.errors import OutputError
@@ -31,6 +31,18 @@ def check_folder(output: Path, mark: str) -> None:
         raise OutputError(f"{output}: no folder can be made there ({home} is a file); choose another with -o")
     if not os.access(home, os.W_OK | os.X_OK):
         raise OutputError(f"{output}: no folder can be made there (no permission in {home}); choose another with -o")
+
+
+def refuse_there(outputs: Iterable[Path], overwrite: bool) -> None:
+    """Raise OutputError where one of `outputs` is there already and nobody asked to replace it; an empty folder may be."""
+    if overwrite:
+        return
+    there = [path for path in outputs if path.exists() and not (path.is_dir() and not any(path.iterdir()))]
+    if there:
+        more = f", as are {len(there) - 1} more of what would be written" if there[1:] else ""
+        raise OutputError(
+            f"{there[0]}: is there already{more}; replace it with --overwrite, or choose another place"
+        )
 
 
 @contextlib.contextmanager

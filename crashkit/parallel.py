@@ -8,8 +8,13 @@ from __future__ import annotations
 import contextlib
 import importlib
 import logging
+import os
+import signal
 import tempfile
+import threading
 from collections.abc import Callable, Iterator, Sequence
+from multiprocessing import active_children, resource_tracker
+from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
 
 from crashkit.errors import CrashkitError
@@ -94,6 +99,39 @@ def _on_workers(
 
 
 @contextlib.contextmanager
+def _later_interrupted() -> Iterator[None]:
+    """Ctrl-C waits until the block ends, and never reaches processes that begin in it: they end with this one.
+
+    A terminal sends it to all of them at once. A process that begins while it is held back holds it back, too.
+    """
+    if os.name != "posix" or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    resource_tracker.ensure_running()  # its own start lets Ctrl-C through again
+    pressed: list[int] = []
+    handler = signal.signal(signal.SIGINT, lambda number, _: pressed.append(number))
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.signal(signal.SIGINT, handler)
+    if pressed:
+        raise KeyboardInterrupt
+
+
+def _ends_at_once(processes: Sequence[BaseProcess]) -> Callable[..., None]:
+    """At the end of a block that was interrupted, `processes` are not waited for: a job may take minutes."""
+
+    def end(kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None and issubclass(kind, KeyboardInterrupt):
+            for process in processes:
+                process.kill()
+
+    return end
+
+
+@contextlib.contextmanager
 def _client(workers: int, scheduler: str | None, patience: float) -> Iterator[Any]:
     """A client of the scheduler at that address, or of processes of our own."""
     import dask
@@ -103,11 +141,14 @@ def _client(workers: int, scheduler: str | None, patience: float) -> Iterator[An
         if scheduler is None:
             scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="crashkit-", ignore_cleanup_errors=True))
             stack.enter_context(dask.config.set({"temporary-directory": scratch}))  # the scheduler's, too
-            cluster = LocalCluster(
-                n_workers=workers, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0",
-                memory_limit=0, silence_logs=logging.CRITICAL,
-            )  # fmt: skip
-            address: Any = stack.enter_context(cluster)
+            with _later_interrupted():
+                before = active_children()
+                cluster = LocalCluster(
+                    n_workers=workers, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0",
+                    memory_limit=0, silence_logs=logging.CRITICAL,
+                )  # fmt: skip
+                address: Any = stack.enter_context(cluster)
+                stack.push(_ends_at_once([child for child in active_children() if child not in before]))
         else:
             address = scheduler
         try:

@@ -119,6 +119,8 @@ class CoarsenedDataset:
         What to know of them, a sentence each.
     problem
         Why no picture was drawn; empty where there is none.
+    replaced
+        Numbers of nodes of an earlier hierarchy that gave way to this one; empty where there was none or the same.
     """
 
     path: Path
@@ -129,6 +131,7 @@ class CoarsenedDataset:
     picture: Path | None
     parts_without_faces: list[str]
     problem: str = ""
+    replaced: tuple[int, ...] = ()
 
 
 def coarsen_with_files(
@@ -141,6 +144,7 @@ def coarsen_with_files(
     selection: Literal["quadric", "vtk"] = "quadric",
     pair_distance: float | None = None,
     test: WhichRuns | None = None,
+    overwrite: bool = False,
     report: Progress | None = None,
 ) -> CoarsenedDataset:
     """Give the dataset at `path` its mesh hierarchy, and draw and write the levels.
@@ -151,16 +155,21 @@ def coarsen_with_files(
         Draw all levels side by side into this file. Where this machine cannot draw, the hierarchy is made all the same.
     vtp
         Write each level as VTP, with its maps, into this folder.
+    overwrite
+        Replace a picture, and VTP files in that folder, that are there.
     nodes, ratios, selection, pair_distance, test, report
         As for `crashkit.coarsen`, as are the errors.
     """
     from crashkit.extras import need
     from crashkit.mesh.export import write_levels
     from crashkit.mesh.store import lifting_errors_over, open_mesh, parts_without_faces, summarize_hierarchy
+    from crashkit.output import refuse_there
 
     if picture is not None:
         need("--picture", "report")
     path = Path(path)
+    refuse_there([Path(p) for p in (picture, vtp) if p is not None], overwrite)
+    before = _nodes_of_levels(path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # parts without faces are in what is returned
         hierarchy = coarsen(
@@ -178,7 +187,19 @@ def coarsen_with_files(
     return CoarsenedDataset(
         path, hierarchy.settings, levels, lifting_errors_over(path), files,
         None if picture is None or problem else Path(picture), parts_without_faces(path), problem,
+        before if before != tuple(row["nodes"] for row in levels) else (),
     )  # fmt: skip
+
+
+def _nodes_of_levels(path: Path) -> tuple[int, ...]:
+    """Nodes of the levels that a dataset has already; none where it has none, or where they are damaged."""
+    from crashkit.errors import CrashkitError
+    from crashkit.mesh.store import has_hierarchy, summarize_hierarchy
+
+    try:
+        return tuple(row["nodes"] for row in summarize_hierarchy(path)) if has_hierarchy(path) else ()
+    except CrashkitError:
+        return ()
 
 
 def _draw(picture: Path, hierarchy: Hierarchy, mesh: MeshArrays, levels: list[dict[str, Any]]) -> str:

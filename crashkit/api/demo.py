@@ -115,6 +115,7 @@ def steps(output: Path, source: Path) -> list[Step]:
             "Three coarser meshes, each a subset of the nodes",
             command("coarsen", data, "--nodes", NODES, "--test", TEST_RUNS, "--picture", output / "levels.png"),
             output / "levels.png",
+            again=("--overwrite",),
         ),
         *(
             Step(
@@ -144,10 +145,12 @@ def steps(output: Path, source: Path) -> list[Step]:
                 "--param", "yield_stress=350MPa", "-o", output / "new_crash.pvd",
             ),
             output / "new_crash.pvd",
+            again=("--overwrite",),
         ),
         Step(
             "Both models as one page with sliders, for any browser or phone",
             command("explore", models["mh"], models["pod-gpr"], "-o", output / "crash.html", "--title", "Kart frame"),
             output / "crash.html",
+            again=("--overwrite",),
         ),
     ]  # fmt: skip

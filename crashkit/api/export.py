@@ -12,7 +12,9 @@ if TYPE_CHECKING:
     from surrogates.surrogate import Surrogate
 
 
-def export_run(dataset: str | Path | xr.Dataset, run: str | int, output: str | Path) -> list[Path]:
+def export_run(
+    dataset: str | Path | xr.Dataset, run: str | int, output: str | Path, *, overwrite: bool = False
+) -> list[Path]:
     """Write one run of a dataset for ParaView: displacement, fields, numbers, part names and parameters.
 
     Parameters
@@ -23,6 +25,8 @@ def export_run(dataset: str | Path | xr.Dataset, run: str | int, output: str | P
         Name or place of the run.
     output
         `.pvd` or `.vtkhdf` (`.vtu` or `.vtp` for a dataset of one state).
+    overwrite
+        Replace a file that is there.
 
     Returns
     -------
@@ -36,26 +40,33 @@ def export_run(dataset: str | Path | xr.Dataset, run: str | int, output: str | P
     ReadError
         If the dataset is damaged.
     OutputError
-        If `output` cannot be written.
+        If `output` cannot be written, or is there.
     """
     from crashkit.dataset import open_dataset, reading_dataset
     from crashkit.errors import OutputError
+    from crashkit.output import refuse_there
     from crashkit.selection import runs_of
     from crashkit.writers.paraview import SUFFIXES
     from crashkit.writers.run import write_run
 
     if Path(output).suffix not in SUFFIXES:
         raise OutputError(f"{output}: a run is written as .pvd or .vtkhdf (.vtu or .vtp for a single state)")
+    refuse_there([Path(output)], overwrite)
     if isinstance(dataset, (str, Path)):
         with open_dataset(dataset, chunks=None) as opened, reading_dataset(dataset):
-            return export_run(opened, run, output)
+            return export_run(opened, run, output, overwrite=overwrite)
     names = [str(name) for name in dataset["sim"].values]
     place = runs_of(names, [run])[0]
     return write_run(dataset.isel(sim=place), Path(output), {"run": names[place]})
 
 
 def export_model(
-    model: Model | Surrogate | str | Path, output: str | Path, level: int | None = None, *, full: bool = False
+    model: Model | Surrogate | str | Path,
+    output: str | Path,
+    level: int | None = None,
+    *,
+    full: bool = False,
+    overwrite: bool = False,
 ) -> float:
     """Write a level of a model for programs without this package.
 
@@ -69,6 +80,8 @@ def export_model(
         A mesh level of the model; without it the finest it has.
     full
         Include the interpolation to the full mesh.
+    overwrite
+        Replace a file that is there.
 
     Returns
     -------
@@ -79,11 +92,15 @@ def export_model(
     ------
     SurrogateError
         For a level that the model does not have, or what cannot be exported.
+    OutputError
+        Where `output` is there.
     """
     from crashkit.extras import need
 
     need("exporting a model", "train")
     from crashkit.api.predict import model_in_hand
+    from crashkit.output import refuse_there
     from surrogates.storage.export import export
 
+    refuse_there([Path(output)], overwrite)
     return export(model_in_hand(model).surrogate, Path(output), level, full=full)

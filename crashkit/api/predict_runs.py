@@ -128,6 +128,7 @@ def predict_runs(
     template: str | Path | None = None,
     coarse_run: str | Path | None = None,
     workers: int = 1,
+    overwrite: bool = False,
     report: Progress = silent,
 ) -> list[PredictedRun]:
     """Predict runs and write them. Give one of `parameters`, `table` and `run`.
@@ -157,6 +158,8 @@ def predict_runs(
         folder that holds a run by the name of each row, or a dataset with these runs.
     workers
         Processes that share the rows of a table; the model must then be a folder.
+    overwrite
+        Replace files that are there; without it they are refused before anything is predicted.
     report
         Called with (what, runs done, runs, "").
 
@@ -167,10 +170,11 @@ def predict_runs(
     ReadError
         For a table or a dataset that cannot be read.
     OutputError
-        Where `output` cannot be written.
+        Where `output` cannot be written, or is there.
     """
     from crashkit.api.predict import model_in_hand
     from crashkit.errors import DataError
+    from crashkit.output import refuse_there
     from crashkit.parallel import as_finished
 
     asked = model_in_hand(model)
@@ -179,6 +183,7 @@ def predict_runs(
 
         parameters = own_parameters(coarse_run, asked.record.ranges.names)
     wanted = _wanted(asked.record, Path(output), parameters, table, run, dataset)
+    refuse_there((one.output for one in wanted), overwrite)
     how = _How(
         time, level, full, extrapolate, band, sensitivity, hide_above, template, coarse_run, several=table is not None
     )

@@ -101,6 +101,7 @@ def steps(study: Study, home: Path) -> list[Step]:
             ("coarsen", str(data), *coarsen, "--test", str(study.train.test), "--picture", str(picture)),
             picture,
             depends=lambda: f"{_checksum(data)} {_has_hierarchy(data)}",
+            again=("--overwrite",),
         )
     )
     models = []

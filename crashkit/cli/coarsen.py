@@ -48,6 +48,9 @@ def command(
         Path | None,
         typer.Option(help="Also write each level as VTP, with its maps, into this folder.", show_default="none"),
     ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace the picture and the VTP files that are there.")
+    ] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Build coarser meshes (subsets of the nodes) and store them in the dataset, with the maps between them."""
@@ -60,13 +63,16 @@ def command(
     with Progress(f"selecting the nodes of {path}", quiet=json) as shown:
         result = coarsen_with_files(
             path, counts or None, factors or None, picture=picture, vtp=vtp,
-            selection="vtk" if selection == "vtk" else "quadric", pair_distance=pair_distance, test=test or None,
+            selection="vtk" if selection == "vtk" else "quadric", pair_distance=pair_distance, test=test or None, overwrite=overwrite,
             report=shown.step,
         )  # fmt: skip
     if json:
         print_json(asdict(result))
         return
     show(path, result.levels, result.interpolation_errors_over)
+    if result.replaced:
+        earlier = ", ".join(map(str, result.replaced))
+        say(f"  it replaces the hierarchy of {earlier} nodes; models trained with that one keep their levels")
     for text in result.parts_without_faces:
         say(f"  {text}")
     if result.problem:

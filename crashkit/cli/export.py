@@ -28,6 +28,7 @@ def command(
         int | None, typer.Option(help="Of a model: the mesh level.", show_default="the finest it has")
     ] = None,
     full: Annotated[bool, typer.Option("--full", help="Of a model: include interpolation to the full mesh.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Write a run of a dataset for ParaView, or a model as ONNX."""
@@ -40,8 +41,8 @@ def command(
     if not (is_model or run):
         fail(f"{source}: is a dataset; name the run to write, such as --run run_008", code=2)
     with Progress(f"reading {source}" if is_model else f"reading run {run} of {source}", quiet=json):
-        files = [] if is_model else export_run(source, run, output)
-        error = export_model(source, output, level, full=full) if is_model else 0.0
+        files = [] if is_model else export_run(source, run, output, overwrite=overwrite)
+        error = export_model(source, output, level, full=full, overwrite=overwrite) if is_model else 0.0
     if json:
         print_json({"output": output, "relative_difference": error} if is_model else {"files": files})
     elif is_model:

@@ -88,6 +88,7 @@ def command(
     write_series: Annotated[
         bool, typer.Option("--write-series", help="With --params: write the rows in parallel, on all processors.")
     ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Predict runs and write them for ParaView or as arrays."""
@@ -102,13 +103,17 @@ def command(
     with Progress(f"reading {model}", quiet=json) as shown:
         from crashkit.api.predict_runs import predict_runs
 
-        rows = predict_runs(
-            model, output, parameters=asked, table=params, run=run or None,
-            dataset=dataset, time=times, level=level, full=full or None, extrapolate=extrapolate, band=band,
-            sensitivity=sensitivity, template=template, workers=(os.cpu_count() or 1) if write_series else 1,
-            coarse_run=coarse_run or None,
-            hide_above=hide_above, report=shown.step,
-        )  # fmt: skip
+        try:
+            rows = predict_runs(
+                model, output, parameters=asked, table=params, run=run or None,
+                dataset=dataset, time=times, level=level, full=full or None, extrapolate=extrapolate, band=band,
+                sensitivity=sensitivity, template=template, workers=(os.cpu_count() or 1) if write_series else 1,
+                coarse_run=coarse_run or None,
+                hide_above=hide_above, overwrite=overwrite, report=shown.step,
+            )  # fmt: skip
+        except KeyboardInterrupt:
+            kept = "; the runs written until then stay, each whole" if params is not None else ""
+            fail(f"interrupted{kept}", code=130)
     if json:
         documents = [row.as_dict() for row in rows]
         print_json(documents if params is not None else documents[0])

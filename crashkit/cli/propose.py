@@ -25,6 +25,7 @@ def command(
         str,
         typer.Option(help="Parameters that change sign in the mirror, with commas.", show_default="those of the box"),
     ] = "",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a table that is there.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the table as JSON, too.")] = False,
 ) -> None:
     """Propose the next runs: without a dataset they fill the box, with one they lower its error most."""
@@ -32,11 +33,13 @@ def command(
 
     from crashkit.api.propose import propose, write_table
     from crashkit.campaign.plan import Method
+    from crashkit.output import refuse_there
 
     if method not in get_args(Method):
         raise typer.BadParameter(f"{method!r}; expected one of {', '.join(get_args(Method))}", param_hint="--method")
     if dataset is None and box is None:
         raise typer.BadParameter("give a dataset, or a box with --box box.yaml", param_hint="DATASET|--box")
+    refuse_there([output], overwrite)
     table = propose(
         dataset, count, box=box, method=method, seed=seed,  # type: ignore[arg-type]
         odd=tuple(names(odd)),
