@@ -40,9 +40,7 @@ def refuse_there(outputs: Iterable[Path], overwrite: bool) -> None:
     there = [path for path in outputs if path.exists() and not (path.is_dir() and not any(path.iterdir()))]
     if there:
         more = f", as are {len(there) - 1} more of what would be written" if there[1:] else ""
-        raise OutputError(
-            f"{there[0]}: is there already{more}; replace it with --overwrite, or choose another place"
-        )
+        raise OutputError(f"{there[0]}: is there already{more}; replace it with --overwrite, or choose another place")
 
 
 @contextlib.contextmanager

@@ -211,6 +211,21 @@ def length(text: str) -> float:
     return value
 
 
+def duration(text: str) -> float:
+    """A time with its unit, such as "15 ms", in s; without a unit it is in s.
+
+    Raises
+    ------
+    UnknownUnits
+        Where it is none.
+    """
+    found = number_and_unit(text)
+    factor, label = to_si(found[1] or "s") if found else (0.0, "")
+    if found is None or label != "s":
+        raise UnknownUnits(f"{text.strip()!r} is no time")
+    return found[0] * factor
+
+
 def is_unit(text: str) -> bool:
     """Whether `text` is a unit of mechanics; a lone "min" is not: it says minimum more often than minute."""
     text = " ".join(text.split())

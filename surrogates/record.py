@@ -84,6 +84,19 @@ class Record:
     coarse: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
+    @property
+    def error_name(self) -> str:
+        """What its errors are called: they come from folds, which judge every training run, or from validation runs."""
+        return "validation error" if self.validation_runs else "error by folds"
+
+    @property
+    def runs_told(self) -> str:
+        """How many runs there are of each kind."""
+        held = f"{len(self.held_out_runs)} held out"
+        if self.validation_runs:
+            return f"{len(self.fitted_runs)} training, {len(self.validation_runs)} validation, {held}"
+        return f"{len(self.fitted_runs)} training{' (judged by folds)' if self.left_out else ''}, {held}"
+
     @classmethod
     def of(cls, campaign: Campaign, settings: Settings, ranges: Ranges, split: ValidationSplit) -> Record:
         names = campaign.runs or tuple(str(k) for k in range(len(campaign.parameters)))

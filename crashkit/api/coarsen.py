@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from crashkit.display import watched
-from data_schema.progress import Progress
+from data_schema.progress import Progress, silent
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -175,6 +175,9 @@ def coarsen_with_files(
         hierarchy = coarsen(
             path, nodes, ratios, selection=selection, pair_distance=pair_distance, test=test, report=report
         )
+    tell = report or silent
+    if picture is not None or vtp is not None:
+        tell("drawing and writing the levels", 0, 0, "")
     levels, mesh = summarize_hierarchy(path), open_mesh(path)
     files = (
         []

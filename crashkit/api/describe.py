@@ -247,7 +247,7 @@ def describe_training(surrogate: Surrogate, output: Path) -> dict[str, Any]:
 
 
 def trained_levels(surrogate: Surrogate) -> list[dict[str, Any]]:
-    """Each level that was trained: its size, how long that took, and its error on validation runs, m."""
+    """Each level that was trained: its size, how long that took, and its error on runs that were left out, m."""
     return [
         {
             "model": name,

@@ -132,7 +132,7 @@ def evaluate(
     sensors = choose_sensors(reference, probes, intrusion)
     with _folder(output) as folder:
         with _counted(tell, "modes of the training runs", len(split.train)) as step:
-            pods = decompose(reference, split.train, done=step)
+            pods = decompose(reference, split.train, done=lambda _: step())
         with tempfile.TemporaryDirectory(dir=folder, prefix=".modes-") as kept:
             scorer = Scorer(source, asked, _keep_modes(pods, Path(kept)), sensors, opened=(reference, stored))
             scored: dict[int, RunScores] = {}
@@ -142,7 +142,8 @@ def evaluate(
                     label=lambda run: f"run {reference.runs[run]}",
                 ):  # fmt: skip
                     scored[place] = scores
-                    step(split.test[place])
+                    step()
+        tell("comparing the models", 0, 0, "")
         result = compare(
             reference, stored, split, seeds_as_spread=seeds_as_spread, pods=pods, scored=[scored[k] for k in sorted(scored)],
             sensors=sensors, context=_context(Path(source.name), reference, stored, split),
@@ -154,11 +155,11 @@ def evaluate(
                 written = []
                 for run in runs:
                     written += write_run(result, run, folder / "vtk", formats)
-                    step(run)
+                    step()
             result = dataclasses.replace(result, files=tuple(written))
         if output is not None:
             with _counted(tell, "figures", len(kinds())) as step:
-                write_report(result, folder, done=lambda name: step(0))
+                write_report(result, folder, done=step)
     _note_bands(asked, result)
     return result
 
@@ -525,14 +526,14 @@ def _own_mesh(surrogate: Surrogate, folder: Path, name: str, level: int, referen
 
 
 @contextlib.contextmanager
-def _counted(tell: Progress, what: str, total: int | None) -> Iterator[Callable[[int], None]]:
-    """Report one step after the other under the name `what`."""
+def _counted(tell: Progress, what: str, total: int | None) -> Iterator[Callable[..., None]]:
+    """Report one step after the other under the name `what`, with the name of each where it has one."""
     count = 0
 
-    def step(_: int) -> None:
+    def step(name: str = "") -> None:
         nonlocal count
         count += 1
-        tell(what, count, total or 0, "")
+        tell(what, count, total or 0, name)
 
     tell(what, 0, total or 0, "")
     yield step

@@ -120,31 +120,20 @@ class Model:
             For parameters that are unknown, missing or no numbers, and far outside the trained range unless
             `extrapolate`.
         SurrogateError
-            For a level the model does not have; with `band`, where too few validation runs were held out.
+            For a level the model does not have; with `band`, where too few runs were left out.
         """
         import numpy as np
         import xarray as xr
 
-        from crashkit.api.parameters import mistaken_unit, parameter_table
+        from crashkit.api.parameters import parameter_table
         from crashkit.errors import DataError
-        from surrogates.data.inputs import far_outside
 
         surrogate, ranges = self.surrogate, self.record.ranges
         values, several = parameter_table(parameters, ranges)
         at = self.time if time is None else np.atleast_1d(np.asarray(time, np.float64))
         number = surrogate.number(level)
         full = level is None if full is None else full
-        beyond = [ranges.beyond(*surrogate.checked(row, at)) for row in values]
-        far = [[] if extrapolate else far_outside(ranges, row[None], at) for row in values]
-        if any(far):
-            said = dict.fromkeys(of_run[name] for of_run, names in zip(beyond, far, strict=True) for name in names)
-            units = [mistaken_unit(parameters, name, ranges) for name in ranges.names if any(name in f for f in far)]
-            raise DataError(
-                f"{'; '.join(said)}: that is far outside, and nothing is known there; "
-                f"{'; '.join(filter(None, units)) or 'check the value and its unit'}, or extrapolate: --extrapolate, "
-                "from Python extrapolate=True"
-            )
-        outside = list(dict.fromkeys(sentence for of_run in beyond for sentence in of_run.values()))
+        outside = self.check(parameters, at, extrapolate=extrapolate)
         if sensitivity and len(values) > 1:
             raise DataError(f"sensitivities are those of one run; found parameters of {len(values)}")
         if coarse_run is not None and (several or sensitivity):
@@ -209,6 +198,42 @@ class Model:
         if not several:
             return out.isel(sim=0)
         return out.assign_coords(sim=[f"prediction_{k}" for k in range(len(values))])
+
+    def check(
+        self, parameters: Mapping[str, Any], time: ArrayLike | None = None, *, extrapolate: bool = False
+    ) -> list[str]:
+        """What `predict` would say of these parameters and times that lie outside the trained range, a sentence each.
+
+        Parameters
+        ----------
+        parameters, time, extrapolate
+            As for `predict`.
+
+        Raises
+        ------
+        DataError, SurrogateError
+            As `predict` would.
+        """
+        import numpy as np
+
+        from crashkit.api.parameters import mistaken_unit, parameter_table
+        from crashkit.errors import DataError
+        from surrogates.data.inputs import far_outside
+
+        ranges = self.record.ranges
+        values, _ = parameter_table(parameters, ranges)
+        at = self.time if time is None else np.atleast_1d(np.asarray(time, np.float64))
+        beyond = [ranges.beyond(*self.surrogate.checked(row, at)) for row in values]
+        far = [[] if extrapolate else far_outside(ranges, row[None], at) for row in values]
+        if any(far):
+            said = dict.fromkeys(of_run[name] for of_run, names in zip(beyond, far, strict=True) for name in names)
+            units = [mistaken_unit(parameters, name, ranges) for name in ranges.names if any(name in f for f in far)]
+            raise DataError(
+                f"{'; '.join(said)}: that is far outside, and nothing is known there; "
+                f"{'; '.join(filter(None, units)) or 'check the value and its unit'}, or extrapolate: --extrapolate, "
+                "from Python extrapolate=True"
+            )
+        return list(dict.fromkeys(sentence for of_run in beyond for sentence in of_run.values()))
 
     def _on_elements(self, values: NDArray[np.float64], time: NDArray[np.float64], level: int) -> dict[str, Any]:
         """What is said of elements, as variables (sim, time, face) of the mesh of `level`."""
@@ -382,8 +407,7 @@ class Model:
             "dataset": f"{record.attributes.get('dataset') or 'not recorded'}, checksum {record.checksum[:12] or 'none'}",
             "parameters": listed(spans),
             "states": f"{len(self.time)} from {self.time[0]:.4g} to {self.time[-1]:.4g} s",
-            "runs": f"{len(record.fitted_runs)} training, {len(record.validation_runs)} validation, "
-            f"{len(record.held_out_runs)} held out",
+            "runs": record.runs_told,
         }
         rows: list[tuple[object, ...]] = [
             (
@@ -393,7 +417,7 @@ class Model:
             for name, level in self.levels.items()
         ]  # fmt: skip
         title = f"crashkit.Model {self.name}: {settings.model}, preset {settings.preset}, {seeds_told(self.surrogate.seeds)}"
-        return title, facts, ("level", "nodes", "latent", "parameters", "validation error (cm)"), rows
+        return title, facts, ("level", "nodes", "latent", "parameters", f"{record.error_name} (cm)"), rows
 
     def __repr__(self) -> str:
         from crashkit.display import as_text

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -184,6 +184,8 @@ def predict_runs(
         parameters = own_parameters(coarse_run, asked.record.ranges.names)
     wanted = _wanted(asked.record, Path(output), parameters, table, run, dataset)
     refuse_there((one.output for one in wanted), overwrite)
+    if table is not None:
+        _check_rows(asked, wanted, table, time, extrapolate)
     how = _How(
         time, level, full, extrapolate, band, sensitivity, hide_above, template, coarse_run, several=table is not None
     )
@@ -203,6 +205,20 @@ def predict_runs(
         found[place] = row
         report("runs", len(found), len(wanted), wanted[place].run)
     return [found[k] for k in range(len(wanted))]
+
+
+def _check_rows(
+    model: Model, wanted: Sequence[_Wanted], table: str | Path, time: ArrayLike | None, extrapolate: bool
+) -> None:
+    """Refuse a table with a row that cannot be predicted before any of them is, naming it."""
+    from crashkit.errors import DataError
+    from surrogates.errors import SurrogateError
+
+    for one in wanted:
+        try:
+            model.check(one.parameters, time, extrapolate=extrapolate)
+        except (DataError, SurrogateError) as error:
+            raise DataError(f"{table}: run {one.run}: {error}") from error
 
 
 @dataclass(frozen=True)

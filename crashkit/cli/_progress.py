@@ -107,7 +107,7 @@ class Progress:
             now = time.monotonic()
             if what != self._now:
                 self._now, self._since = what, now
-            self._text = text
+            self._text = f"{text} done, going on" if finished else text
             if self._shown is not None:
                 self._shown.update(_fitted(text))
             if (finished and text != self._said) or (not self._live and now - self._last >= _BETWEEN):

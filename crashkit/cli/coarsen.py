@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from crashkit.api.coarsen import coarsen_with_files
-from crashkit.cli._console import numbers, print_json, say, table, what_next
+from crashkit.cli._console import fixed, numbers, print_json, say, table, what_next
 from crashkit.cli._progress import Progress
 
 
@@ -72,7 +72,7 @@ def command(
     show(path, result.levels, result.interpolation_errors_over)
     if result.replaced:
         earlier = ", ".join(map(str, result.replaced))
-        say(f"  it replaces the hierarchy of {earlier} nodes; models trained with that one keep their levels")
+        say(f"  it replaces the hierarchy of {earlier} nodes, and evaluate asks to train models of that one again")
     for text in result.parts_without_faces:
         say(f"  {text}")
     if result.problem:
@@ -93,8 +93,8 @@ def show(path: Path, levels: list[dict[str, Any]], over: str) -> None:
                 row["nodes"],
                 row["faces"],
                 row["edges"],
-                f"{100 * row['distance_mean']:.3f} / {100 * row['distance_max']:.2f}",
-                f"{100 * row['lifting_error_mean']:.3f} / {100 * row['lifting_error_max']:.2f}",
+                f"{fixed(row['distance_mean'], 3, 100)} / {fixed(row['distance_max'], 2, 100)}",
+                f"{fixed(row['lifting_error_mean'], 3, 100)} / {fixed(row['lifting_error_max'], 2, 100)}",
             )
             for row in levels
         ),
@@ -105,7 +105,7 @@ def show(path: Path, levels: list[dict[str, Any]], over: str) -> None:
             "Interpolation error by part: mean over the part's nodes (cm)",
             ("part", *(f"level {row['level']}" for row in levels)),
             (
-                (name, *(f"{100 * row['lifting_error_of_parts'][name]:.3f}" for row in levels))
+                (name, *(fixed(row["lifting_error_of_parts"][name], 3, 100) for row in levels))
                 for name in sorted(parts, key=lambda name: _descending(levels[-1]["lifting_error_of_parts"][name]))
             ),
         )

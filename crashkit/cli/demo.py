@@ -45,4 +45,4 @@ def show(result: DemoResult) -> None:
     say("Open next:")
     for path, what in result.files.items():
         say(f"  {path}  {what}")
-    what_next(None, ("info", result.model), ("run", "study.yaml"))
+    what_next(None, ("info", result.model), ("ingest", "YOUR_RUNS", "-o", "crash.zarr"))

@@ -86,11 +86,11 @@ def _print_dataset(found: dict[str, Any]) -> None:
 def _print_levels(levels: list[dict[str, Any]], over: str) -> None:
     table(
         f"mesh hierarchy, interpolation errors over {over}",
-        ("level", "nodes", "faces", "distance mean / max (mm)", "interpolation error mean / max (cm)"),
+        ("level", "nodes", "faces", "distance mean / max (cm)", "interpolation error mean / max (cm)"),
         [
             (
                 level["level"], level["nodes"], level["faces"],
-                f"{level['distance_mean'] * 1e3:.2f} / {level['distance_max'] * 1e3:.1f}",
+                f"{level['distance_mean'] * 100:.3f} / {level['distance_max'] * 100:.2f}",
                 f"{level['lifting_error_mean'] * 100:.3f} / {level['lifting_error_max'] * 100:.2f}",
             )
             for level in levels
@@ -121,7 +121,7 @@ def _print_model(found: dict[str, Any]) -> None:
     _print_parameters(found["parameters"])
     table(
         "levels",
-        ("model", "level", "nodes", "latent", "parameters", "validation error (cm)", "on the full mesh (cm)", "band"),
+        ("model", "level", "nodes", "latent", "parameters", f"{found['error_name']} (cm)", "on the full mesh (cm)", "band"),
         [
             (
                 r["model"], r["level"], r["nodes"], r["latent"], r["parameters"],

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from crashkit.cli._console import fail, look_in_paraview, numbers, print_json, say, table
+from crashkit.cli._console import fail, look_in_paraview, print_json, say, table
 from crashkit.cli._progress import Progress
 
 if TYPE_CHECKING:
@@ -53,7 +53,8 @@ def command(
         ),
     ] = Path("prediction.pvd"),
     time: Annotated[
-        str, typer.Option(help="Times in s: 0.015 or 0,0.01,0.02.", show_default="those of the training runs")
+        str,
+        typer.Option(help="Times: 15ms or 0,0.01,0.02 (s without a unit).", show_default="those of the training runs"),
     ] = "",
     level: Annotated[
         int | None, typer.Option(help="Mesh level, on its own nodes.", show_default="full mesh, from the finest level")
@@ -176,7 +177,12 @@ def given(texts: Iterable[str], option: str = "--param", example: str = "impact_
 
 
 def _times(text: str) -> list[float] | None:
-    times = numbers(text, "--time", "0.015 or 0,0.01,0.02", kind="seconds")
+    from data_schema.units import UnknownUnits, duration
+
+    try:
+        times = [duration(piece) for piece in text.split(",")] if text else []
+    except UnknownUnits as error:
+        raise typer.BadParameter(f"{error}; expected such as 15ms or 0,0.01,0.02", param_hint="--time") from error
     if any(b <= a for a, b in itertools.pairwise(times)):
         raise typer.BadParameter(f"{text!r}; expected increasing times, each once", param_hint="--time")
     return times or None

@@ -129,7 +129,7 @@ def epoch_lines(shown: Progress, verbose: bool = False) -> Callable[[Epoch], Non
 
 
 def show(surrogate: Surrogate, output: Path) -> None:
-    """What was trained and how well it does on validation runs."""
+    """What was trained and how well it does on runs that were left out."""
     from crashkit.api.numbers import told_beside
     from evaluation.report.page import plain
 
@@ -137,9 +137,8 @@ def show(surrogate: Surrogate, output: Path) -> None:
     for text in record.notes:
         say(f"note: {text}")
     table(
-        f"{output}: {len(record.fitted_runs)} training, {len(record.validation_runs)} validation, "
-        f"{len(record.held_out_runs)} held-out runs",
-        ("model", "nodes", "parameters", "epochs", "best", "training (s)", "validation error (cm)"),
+        f"{output}: runs {record.runs_told}",
+        ("model", "nodes", "parameters", "epochs", "best", "training (s)", f"{record.error_name} (cm)"),
         (
             (
                 r["model"], r["nodes"], r["parameters"], r["epochs"] or "-", r["best_epoch"] or "-",

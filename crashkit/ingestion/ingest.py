@@ -252,7 +252,7 @@ class _Job:
             fresh = [f for f in fresh if f.name in staged]
             if not fresh:
                 raise DataError(f"no run can be used ({look.reasons()})")
-            self.tell("ingest", len(fresh), len(fresh), "putting the dataset together")
+            self.tell("putting the dataset together", 0, 0, "")
             hierarchy = _hierarchy_of(former)
             names = publish(staging, layout, fresh, staged, old, hashes, marked)
         if hierarchy is not None:

@@ -74,6 +74,8 @@ def write_hierarchy(
             with _target(path) as target:
                 target.group("hierarchy", about)
                 errors = _stream(path, dataset, hierarchy, target, test, report)
+                if report is not None:
+                    report("writing the levels", 0, 0, "")
                 for level, error in zip(hierarchy.levels, errors, strict=True):
                     _write_level(target, level, error)
         except OSError as error:

@@ -47,19 +47,28 @@ def parameter_name(title: str, place: str) -> str:
     return name
 
 
+def _check_brackets(title: str, place: str) -> None:
+    """Refuse "speed [m/s", whose name would hold the unit."""
+    for opened, closed in ("[]", "()"):
+        if title.count(opened) != title.count(closed):
+            missing = closed if title.count(opened) > title.count(closed) else opened
+            raise ReadError(f"{place}: column {title!r} lacks a bracket {missing!r}; expected such as 'speed [m/s]'")
+
+
 def parameter_columns(titles: Sequence[str], units: Sequence[str], place: str) -> list[tuple[str, str]]:
     """(name, unit) of every column, from its title and the unit stated beside it ("" for none).
 
     Raises
     ------
     ReadError
-        Naming `place` and both columns where two would be one parameter.
+        Naming `place` and both columns where two would be one parameter, and a column that lacks a bracket.
     """
     from data_schema.units import is_unit
 
     out: list[tuple[str, str]] = []
     first: dict[str, str] = {}
     for title, beside in zip(titles, units, strict=True):
+        _check_brackets(title, place)
         plain, unit = split_title(title, is_unit)
         name = parameter_name(plain, place)
         other = first.setdefault(name.lower(), title)

@@ -212,12 +212,24 @@ def read_formula(text: str, name: str = "") -> Formula:
         for node in _values(tree):
             _check(node, text.strip(), label)
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        if lacks := _bracket_missing(text):
+            raise EvaluationError(f"{label}{text.strip()} lacks {lacks}") from error
         at = f" at character {error.offset}" if isinstance(error, SyntaxError) and error.offset else ""
         raise EvaluationError(
             f"{label}{text.strip()} is no formula{at}; expected for example max(displacement(part=box, along=x)) or "
             "cfc60(wall_force).max()"
         ) from error
     return Formula(name or text.strip(), text.strip(), tree)
+
+
+def _bracket_missing(text: str) -> str:
+    """Which bracket is missing, in words; empty where they come in pairs."""
+    depth = 0
+    for character in re.sub(r"'[^']*'|\"[^\"]*\"", "", text):
+        depth += {"(": 1, ")": -1}.get(character, 0)
+        if depth < 0:
+            return "an opening bracket '('"
+    return f"{depth} closing brackets ')'" if depth > 1 else "a closing bracket ')'" if depth else ""
 
 
 def read_formulas(texts: Mapping[str, str]) -> dict[str, Formula]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -28,6 +29,8 @@ from evaluation.report.page import (
     show_table,
 )
 from evaluation.report.verdict import RULES, statements
+
+_log = logging.getLogger(__name__)
 
 _HEADINGS = {
     "model": "model", "nodes": "nodes", "error_cm": "mean node error (cm)", "spread_cm": "± over seeds (cm)",
@@ -94,6 +97,7 @@ def write_report(
         figure_numbers[kind.name] = drawing.numbers()
         if done:
             done(kind.name)
+    _log.info("the page and its view in three dimensions" if view else "the page")
     views, left_out = _views(evaluation) if view else ([], "")
     rows = tables.performance(evaluation)
     performance = tables.columns(rows)

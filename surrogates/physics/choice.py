@@ -180,6 +180,11 @@ class _Search:
             powers = parse_monomial(text, self.names)
             used = [k for k, power in enumerate(powers) if power]
             bad = [self.names[k] for k in used if not is_positive(self.parameters[:, k])]
+            if bad and len(used) == 1:
+                raise SurrogateError(
+                    f"inputs.derived: {text!r} is a parameter by itself, which is an input as it is where it is not positive "
+                    "or hardly changes; leave it out, and name products of powers of positive parameters"
+                )
             if bad:
                 raise SurrogateError(
                     f"inputs.derived: {text!r} takes the logarithm of {bad[0]}, which is not positive or hardly changes"

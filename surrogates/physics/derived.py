@@ -275,6 +275,8 @@ class _Monomial:
         token = self._take()
         if token == "(":
             out = self._product()
+            if self._next() is None:
+                raise SurrogateError(f"inputs.derived: {self.text!r} lacks a closing bracket ')'")
             if self._take() != ")":
                 self._refuse()
         elif token in self.names:

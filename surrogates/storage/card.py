@@ -72,7 +72,11 @@ def card(surrogate: Surrogate) -> str:
     lines += [f"- {_plain(key)}: {_plain(value)}" for key, value in record.attributes.items()]
     lines += [
         f"- {len(record.fitted_runs)} training runs: {_runs(record.fitted_runs)}",
-        f"- {len(record.validation_runs)} validation runs: {_runs(record.validation_runs)}",
+        *(
+            [f"- {len(record.validation_runs)} validation runs: {_runs(record.validation_runs)}"]
+            if record.validation_runs
+            else []
+        ),
         f"- {len(record.held_out_runs)} runs kept away: {_runs(record.held_out_runs)}",
         "",
     ]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,16 +16,20 @@ from surrogates.physics.trials import Folds, Trials, courses_of
 from surrogates.settings import Settings
 from surrogates.surrogate import Surrogate
 
+# What solvers call results on elements, for what was misspelt.
+_USUAL_FIELDS = ("plastic_strain", "von_mises", "thickness", "energy")
+
 
 def check_targets(campaign: Campaign, settings: Settings) -> None:
     """Raise SurrogateError for a target that the campaign does not hold."""
     known = [t.name for t in campaign.targets]
     for name in settings.targets:
         if name != "displacement" and not name.startswith("history:") and name not in known:
-            raise SurrogateError(
-                f"targets names {name!r}, and the dataset has {', '.join(known) or 'no result on elements'}; keep it with "
-                f"crashkit ingest --fields {name}"
-            )
+            there = ["displacement", *known]
+            near = next(iter(difflib.get_close_matches(name, [*there, *_USUAL_FIELDS], n=1)), name)
+            keep = f"results on elements are kept by crashkit ingest --fields {near}"
+            cure = keep if near == name else f"did you mean {near!r}?" + ("" if near in there else f" {keep}")
+            raise SurrogateError(f"targets names {name!r}, and the dataset has {', '.join(there)}; {cure}")
 
 
 def fit_beside(

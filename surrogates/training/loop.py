@@ -81,7 +81,7 @@ class Epoch:
     def note(self) -> str:
         """How good it is, in centimetres where there are validation runs."""
         if math.isnan(self.validation_error):
-            return f"training loss {self.total:.2e}, no validation runs"
+            return f"training loss {self.total:.2e}"
         best = f"best {100 * self.best_error:.2f}, epoch {self.best_epoch}"
         return f"validation {100 * self.validation_error:.2f} cm ({best})"
 

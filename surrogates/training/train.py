@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -174,7 +175,9 @@ def curve_targets(campaign: Campaign, settings: Settings) -> tuple[CurveTarget, 
         names = names or [n for n in known if n in {f"{wish}_{axis}" for axis in "xyz"}]
         if not names:
             some = ", ".join(known[:16]) or "no history"
-            raise SurrogateError(f"targets names {target!r}, and the dataset has {some}")
+            near = difflib.get_close_matches(wish, known, n=1, cutoff=0.5)
+            hint = f"; did you mean 'history:{near[0]}'?" if near else ""
+            raise SurrogateError(f"targets names {target!r}, and the dataset has {some}{hint}")
         out |= {c.name: c for c in campaign.curves if c.name in names}
     return tuple(out.values())
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from crashkit.errors import OutputError
-from crashkit.output import complete_folder, file_name
+from crashkit.output import complete_folder, file_name, refuse_there
 
 
 def test_an_earlier_result_is_replaced_as_a_whole(tmp_path):
@@ -57,6 +57,17 @@ def test_below_a_file_nothing_can_be_made(tmp_path):
         complete_folder(tmp_path / "file" / "out", "mark.json"),
     ):
         pass
+
+
+def test_what_is_there_is_replaced_only_when_asked_for(tmp_path):
+    (tmp_path / "a.pvd").write_text("")
+    (tmp_path / "b.pvd").write_text("")
+    (tmp_path / "empty").mkdir()
+    both = [tmp_path / name for name in ("a.pvd", "b.pvd", "new.pvd", "empty")]
+    with pytest.raises(OutputError, match=r"a\.pvd: is there already, as are 1 more .*--overwrite"):
+        refuse_there(both, False)
+    refuse_there(both, True)
+    refuse_there(both[2:], False)
 
 
 def test_names_become_file_names():

@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import pytest
 
@@ -86,6 +91,38 @@ def test_without_dask_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)
     with pytest.raises(MissingExtraError, match=r"crashkit\[distributed\]"):
         as_finished(times, [1, 2], 2, workers=2)
+
+
+def note_and_sleep(item: int, folder: str) -> None:
+    Path(folder, str(item)).touch()
+    time.sleep(60)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="a group of processes gets the signal of Ctrl-C")
+def test_ctrl_c_ends_workers_at_once_and_without_a_word_of_theirs(tmp_path):
+    work = (
+        "from crashkit.parallel import as_finished\nfrom test_parallel import note_and_sleep\n"
+        "if __name__ == '__main__':\n"
+        "    try:\n"
+        f"        list(as_finished(note_and_sleep, [1, 2], {str(tmp_path)!r}, workers=2))\n"
+        "    except KeyboardInterrupt:\n"
+        "        print('interrupted')\n"
+    )
+    (tmp_path / "work.py").write_text(work)
+    paths = os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])
+    told = subprocess.Popen(
+        [sys.executable, str(tmp_path / "work.py")], env={**os.environ, "PYTHONPATH": paths, "TMPDIR": str(tmp_path)},
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
+    )  # fmt: skip
+    try:
+        while not (tmp_path / "2").exists():
+            assert told.poll() is None
+            time.sleep(0.1)
+        os.killpg(told.pid, signal.SIGINT)
+        assert told.communicate(timeout=40)[0] == "interrupted\n"
+    finally:
+        if told.poll() is None:
+            os.killpg(told.pid, signal.SIGKILL)
 
 
 def test_nothing_stays_in_the_temporary_folder(tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from data_schema import UnknownUnits, si_unit, to_si, unit_system
-from data_schema.units import _USUAL, _understood, is_unit, length, number_and_unit
+from data_schema.units import _USUAL, _understood, duration, is_unit, length, number_and_unit
 
 
 @pytest.mark.parametrize(
@@ -181,6 +181,17 @@ def test_a_length_is_in_metres(text: str, metres: float) -> None:
 def test_what_is_no_length_is_refused(text: str) -> None:
     with pytest.raises(UnknownUnits):
         length(text)
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("15ms", 0.015), ("0.015", 0.015), (" 2 s", 2.0), ("0", 0.0)])
+def test_a_duration_is_in_seconds(text: str, seconds: float) -> None:
+    assert duration(text) == pytest.approx(seconds)
+
+
+@pytest.mark.parametrize("text", ["", "soon", "15 mm", "15 furlets"])
+def test_what_is_no_duration_is_refused(text: str) -> None:
+    with pytest.raises(UnknownUnits):
+        duration(text)
 
 
 def test_a_number_and_what_stands_behind_it() -> None:

@@ -52,3 +52,20 @@ def test_options_that_do_not_belong_together(model: Path, tmp_path: Path) -> Non
     assert (code, "give it with --params" in err) == (2, True)
     code, _, err = run("predict", model, *ASKED, "--template", "d3plot", "-o", tmp_path / "x.npz")
     assert (code, "a template is for LS-DYNA" in err) == (1, True)
+
+
+def test_files_that_are_there_are_replaced_only_when_asked_for(model: Path, tmp_path: Path) -> None:
+    (tmp_path / "run.npz").write_text("mine")
+    code, _, err = run("predict", model, *ASKED, "-o", tmp_path / "run.npz")
+    assert (code, "run.npz: is there already; replace it with --overwrite" in err) == (1, True)
+    assert (tmp_path / "run.npz").read_text() == "mine"
+    assert run("predict", model, *ASKED, "--time", "15ms,0.03", "-o", tmp_path / "run.npz", "--overwrite")[0] == 0
+    assert np.load(tmp_path / "run.npz")["time"].tolist() == [0.015, 0.03]
+
+
+def test_a_row_that_cannot_be_predicted_is_named_before_any_is(model: Path, tmp_path: Path) -> None:
+    table = tmp_path / "runs.csv"
+    table.write_text("run,impact_speed,impact_angle,yield_stress [MPa]\na,15,0,300\nb,20,5,40000\n")
+    code, _, err = run("predict", model, "--params", table, "-o", tmp_path / "out")
+    assert (code, "runs.csv: run b: yield_stress = " in err) == (1, True)
+    assert not (tmp_path / "out").exists()

@@ -70,6 +70,14 @@ def test_finished_work_is_said_once(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err == "runs 3/3\n"
 
 
+def test_counted_work_that_ended_does_not_look_as_if_it_hung(capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+    monkeypatch.setattr("crashkit.cli._progress.SILENCE", 0.3)
+    with Progress("starting") as shown:
+        shown.step("test runs", 9, 9)
+        time.sleep(0.8)
+    assert "test runs 9/9 done, going on ... " in capsys.readouterr().err
+
+
 def test_json_has_neither_nan_nor_infinity(capsys: pytest.CaptureFixture[str]) -> None:
     print_json({"a": float("nan"), "b": [float("inf"), -float("inf"), 1.5]})
     assert capsys.readouterr().out.split() == ["{", '"a":', "null,", '"b":', "[", "null,", "null,", "1.5", "]", "}"]

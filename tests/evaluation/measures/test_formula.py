@@ -189,3 +189,16 @@ def test_any_text_is_read_or_refused_in_one_line(text: str) -> None:
 @given(st.dictionaries(st.sampled_from(["kg", "m", "s", "K"]), st.integers(-4, 4)))
 def test_units_go_there_and_back(exponents: dict[str, int]) -> None:
     assert powers(unit_of(exponents)) == {base: p for base, p in exponents.items() if p}
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("max(displacement(part=box)", "lacks a closing bracket"),
+        ("max(displacement(part='b)x'", "lacks 2 closing brackets"),
+        ("max(speed))", "lacks an opening bracket"),
+    ],
+)
+def test_a_missing_bracket_is_named(text: str, told: str) -> None:
+    with pytest.raises(EvaluationError, match=told):
+        read_formula(text)

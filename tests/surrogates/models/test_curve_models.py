@@ -70,6 +70,20 @@ def test_channels_are_named_by_pattern_and_by_resultant(surrogate: Surrogate) ->
         )
 
 
+@pytest.mark.parametrize(
+    ("target", "told"),
+    [
+        ("history:forcex", r"did you mean 'history:force_x'\?"),
+        ("displacment", r"has displacement; did you mean 'displacement'\?"),
+        ("plastic_strian", r"did you mean 'plastic_strain'\? results on elements are kept by crashkit ingest --fields"),
+    ],
+)
+def test_a_misspelt_target_is_told_with_the_nearest_name(target: str, told: str) -> None:
+    campaign = plate.campaign(6, curves=targets(plate.parameters(6)), curve_time=TIME)
+    with pytest.raises(SurrogateError, match=told):
+        train_surrogate(campaign, settings("pod-gpr", overrides=[f"targets=[displacement, {target}]"]))
+
+
 def test_each_left_out_run_is_predicted_without_it(surrogate: Surrogate) -> None:
     curve = surrogate.curves["force_x"]
     assert sorted(curve.held) == list(range(24))

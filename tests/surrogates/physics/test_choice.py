@@ -186,3 +186,9 @@ def test_the_first_state_is_zero_and_the_initial_velocity_is_exact(trained: Surr
     assert np.abs(u[:, 0]).max() < 1e-7
     flight = asked[:, :1] / 20 * TIME / TIME[-1]
     np.testing.assert_allclose(u[..., 0].mean(axis=2), flight, atol=2e-5 * flight.max())
+
+
+def test_one_parameter_that_has_no_logarithm_is_no_monomial() -> None:
+    chosen = settings("pod-gpr", overrides=["inputs.derived=[offset]"])
+    with pytest.raises(SurrogateError, match=r"'offset' is a parameter by itself.*leave it out"):
+        found(crash(16), chosen)

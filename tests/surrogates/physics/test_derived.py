@@ -50,7 +50,7 @@ def test_monomials_are_read(text: str, powers: tuple[float, ...]) -> None:
         ("speed/speed", "is constant"),
         ("__import__('os').system('true')", "__import__"),
         ("speed**strength", "not understood"),
-        ("(speed", "its end"),
+        ("(speed", "lacks a closing bracket"),
         ("speed)", "not understood"),
         ("2*speed", "not understood"),
     ],
