@@ -11,6 +11,10 @@ if TYPE_CHECKING:
     from data_schema import Violation
 
 
+# Values of a variable that are read again, whole, at no cost.
+_SMALL = 1 << 20
+
+
 def validate(dataset: str | Path | xr.Dataset, *, values: bool = True) -> list[Violation]:
     """Every violation of the rules of a crash dataset; an empty list means the dataset is good.
 
@@ -26,8 +30,11 @@ def validate(dataset: str | Path | xr.Dataset, *, values: bool = True) -> list[V
     Raises
     ------
     ReadError
-        Where there is no dataset, or its values cannot be read.
+        Where there is no dataset, or its values, or those of its hierarchy, cannot be read.
+    DataError
+        Where the hierarchy is not one of this dataset.
     """
+    import numpy as np
     import xarray as xr
 
     from crashkit.dataset import open_dataset, reading_dataset
@@ -37,7 +44,26 @@ def validate(dataset: str | Path | xr.Dataset, *, values: bool = True) -> list[V
         with reading_dataset(str(dataset.encoding.get("source", "the dataset in memory"))):
             return violations(_alone(dataset), values=values)
     with open_dataset(dataset, chunks=None) as opened, reading_dataset(dataset):
-        return violations(opened, values=values)
+        found = violations(opened, values=values)
+        if values:
+            for variable in opened.variables.values():  # results were read by state; what is small, no rule may ask for
+                if variable.size <= _SMALL:
+                    np.asarray(variable[...])
+    if values and not found:
+        _read_levels(Path(dataset))
+    return found
+
+
+def _read_levels(path: Path) -> None:
+    """Read the hierarchy, if there is one, and the displacements stored with it: what is damaged is refused as elsewhere."""
+    from crashkit.dataset import reading_dataset
+    from crashkit.mesh.store import has_hierarchy, level_displacement, open_hierarchy, runs_of_hierarchy
+
+    if has_hierarchy(path):
+        with reading_dataset(path):
+            open_hierarchy(path)
+            for run in range(runs_of_hierarchy(path)):
+                level_displacement(path, 1, [run])
 
 
 def _alone(dataset: xr.Dataset) -> xr.Dataset:

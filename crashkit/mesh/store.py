@@ -132,6 +132,11 @@ def open_hierarchy(path: str | Path) -> Hierarchy:
     return Hierarchy(n_full, tuple(levels), json.loads(about["settings"]))
 
 
+def runs_of_hierarchy(path: str | Path) -> int:
+    """For how many runs the hierarchy at `path` holds displacements."""
+    return len(json.loads(_about(Path(path))["runs"]))
+
+
 def level_displacement(path: str | Path, level: int, runs: Sequence[int] | None = None) -> NDArray[np.float32]:
     """Displacements (sim, time, node of `level`, 3), m, of the runs numbered `runs` (all without), level >= 1.
 

@@ -28,7 +28,7 @@ from crashkit.readers._names import (
     vectors_among,
 )
 from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh
-from crashkit.readers.checks import holds_positions, reading, require_finite, time_problems
+from crashkit.readers.checks import closed_if_refused, holds_positions, reading, require_finite, time_problems
 
 # VTK cell type -> (corners that are kept, in the order of the linear cell, its type). Middle nodes are left out.
 _FACES = {5: (0, 1, 2), 8: (0, 1, 3, 2), 9: (0, 1, 2, 3), 22: (0, 1, 2), 23: (0, 1, 2, 3), 28: (0, 1, 2, 3)}
@@ -61,6 +61,11 @@ class GridRun(Run):
 
     def __init__(self, name: str, source: GridSource, solver: str = "unknown") -> None:
         self.name, self.solver, self._source = name, solver, source
+        with closed_if_refused(source):
+            self._understand(source)
+
+    def _understand(self, source: GridSource) -> None:
+        """Look at the first state, and say what the points and arrays mean."""
         self.files, self.time = source.files, source.time
         if not len(self.time):
             raise ReadError(f"{source.files[0]}: no state found")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +28,19 @@ def reading(place: object) -> Iterator[None]:
     except LIBRARY_ERRORS as error:
         text = " ".join(str(error).split()) or type(error).__name__
         raise ReadError(f"{place}: cannot be read ({text}); it is cut short or damaged, copy it again") from error
+
+
+@contextmanager
+def closed_if_refused(*opened: Any) -> Iterator[None]:
+    """What a run has opened is closed again where the block raises, and not when memory is tidied up."""
+    try:
+        yield
+    except BaseException:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # SciPy keeps a file mapped as long as arrays look into it
+            for file in opened:
+                file.close()
+        raise
 
 
 def time_problems(time: NDArray[np.float64], places: Sequence[object]) -> list[str]:

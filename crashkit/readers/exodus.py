@@ -31,7 +31,7 @@ from crashkit.readers._grid_run import GridRun
 from crashkit.readers._hdf5_data import SIGNATURE, files_behind
 from crashkit.readers._names import vectors_among
 from crashkit.readers.base import Run, Runs
-from crashkit.readers.checks import LIBRARY_ERRORS, reading, require_options
+from crashkit.readers.checks import LIBRARY_ERRORS, closed_if_refused, reading, require_options
 
 # Zeros behind a classic file up to this many are padding.
 _PADDING = 1 << 20
@@ -162,16 +162,17 @@ class _Blocks(GridSource):
     def __init__(self, file: Path) -> None:
         self.file = file
         self._opened = _opened(file)
-        self._behind: dict[str, set[Path]] = {}
-        self.time = np.asarray(self._take("time_whole", ...), np.float64).reshape(-1)
-        self._points = self._coordinates()
-        self._read_blocks()
-        self._nodal = _grouped(self._texts("name_nod_var"))
-        self._element = _grouped(self._texts("name_elem_var"))
-        for column in (c for columns in self._nodal.values() for c in columns):
-            self._require_present(f"vals_nod_var{column + 1}")
-        self.files = (file, *sorted(set().union(*self._behind.values())))
-        self.problems = self._unread()
+        with closed_if_refused(self._opened):
+            self._behind: dict[str, set[Path]] = {}
+            self.time = np.asarray(self._take("time_whole", ...), np.float64).reshape(-1)
+            self._points = self._coordinates()
+            self._read_blocks()
+            self._nodal = _grouped(self._texts("name_nod_var"))
+            self._element = _grouped(self._texts("name_elem_var"))
+            for column in (c for columns in self._nodal.values() for c in columns):
+                self._require_present(f"vals_nod_var{column + 1}")
+            self.files = (file, *sorted(set().union(*self._behind.values())))
+            self.problems = self._unread()
 
     def place(self, state: int) -> str:
         return f"{self.file}, state {state}"
@@ -298,25 +299,32 @@ class _Pieces(GridSource):
                 f"{files[0]}: of its {count} pieces number {missing[0] if missing else count} is missing; join the whole "
                 "run with epu, or copy all pieces"
             )
-        self._pieces = [_Blocks(found[k]) for k in sorted(found)]
-        self.files = tuple(f for piece in self._pieces for f in piece.files)
-        self.problems = tuple(p for piece in self._pieces for p in piece.problems)
-        self.time = self._pieces[0].time
-        self._grids = [piece.first() for piece in self._pieces]
-        for piece, grid in zip(self._pieces, self._grids, strict=True):
-            if not np.array_equal(piece.time, self.time):
-                raise ReadError(f"{piece.file}: has other times than {self._pieces[0].file.name}; join them with epu")
-            if "node_id" not in grid.point_data or "element_id" not in grid.cell_data:
+        self._pieces: list[_Blocks] = []
+        with closed_if_refused(self):
+            for k in sorted(found):
+                self._pieces.append(_Blocks(found[k]))
+            self.files = tuple(f for piece in self._pieces for f in piece.files)
+            self.problems = tuple(p for piece in self._pieces for p in piece.problems)
+            self.time = self._pieces[0].time
+            self._grids = [piece.first() for piece in self._pieces]
+            for piece, grid in zip(self._pieces, self._grids, strict=True):
+                if not np.array_equal(piece.time, self.time):
+                    raise ReadError(
+                        f"{piece.file}: has other times than {self._pieces[0].file.name}; join them with epu"
+                    )
+                if "node_id" not in grid.point_data or "element_id" not in grid.cell_data:
+                    raise ReadError(
+                        f"{piece.file}: is piece of a run and has no node_num_map or elem_num_map; join the pieces with epu"
+                    )
+            ids = np.concatenate([g.point_data["node_id"] for g in self._grids])
+            self._node_id, self._first, inverse = np.unique(ids, return_index=True, return_inverse=True)
+            self._inverse = inverse.reshape(-1)
+            points = np.concatenate([g.points for g in self._grids])
+            self._points = points[self._first]
+            if not np.array_equal(self._points[self._inverse], points):
                 raise ReadError(
-                    f"{piece.file}: is piece of a run and has no node_num_map or elem_num_map; join the pieces with epu"
+                    f"{files[0]}: its pieces have nodes of one number in different places; join them with epu"
                 )
-        ids = np.concatenate([g.point_data["node_id"] for g in self._grids])
-        self._node_id, self._first, inverse = np.unique(ids, return_index=True, return_inverse=True)
-        self._inverse = inverse.reshape(-1)
-        points = np.concatenate([g.points for g in self._grids])
-        self._points = points[self._first]
-        if not np.array_equal(self._points[self._inverse], points):
-            raise ReadError(f"{files[0]}: its pieces have nodes of one number in different places; join them with epu")
 
     def place(self, state: int) -> str:
         return f"{self.files[0]} and its pieces, state {state}"

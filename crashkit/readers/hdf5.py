@@ -36,6 +36,7 @@ from crashkit.readers._names import quantity
 from crashkit.readers.base import FieldInfo, Parameter, Part, Run, RunMesh, Runs
 from crashkit.readers.checks import (
     LIBRARY_ERRORS,
+    closed_if_refused,
     reading,
     require_finite,
     require_indices,
@@ -114,36 +115,37 @@ class _Campaign:
     def __init__(self, path: Path, mesh: Path | None, step: float | None) -> None:
         self.path = path
         self.file = _open(path)
-        self._behind: dict[str, set[Path]] = {}
-        self.notes: tuple[str, ...] = ()
-        group = _group(self.file)
-        if group is None:
-            raise ReadError(
-                f"{path}: no group with datasets {' and '.join(_NEEDED)}; found {', '.join(self.file) or 'nothing'}"
-            )
-        self.group = group
-        self.displacements = self._dataset("displacements", 4)
-        self.runs, self.states, self.nodes, xyz = self.displacements.shape
-        if xyz != 3 or 0 in self.displacements.shape:
-            raise self._wrong("displacements", "(run, state, node, 3), none of them 0")
-        self.reference = self._dataset("reference_configuration", 2, 3)
-        if self.reference.shape[-2:] != (self.nodes, 3) or self.reference.shape[:-2] not in ((), (self.runs,)):
-            raise self._wrong("reference_configuration", f"({self.runs}, {self.nodes}, 3)")
-        self.faces = self._faces(mesh)
-        self.time = self._time(step)
-        self.parameters = self._parameters()
-        self.numbers = self._numbers()
-        self.alive = self._if_there("alive", (self.runs, self.states, len(self.faces)))
-        self.parts, self.face_part = self._parts()
-        self.node_id = self._identities("node_id", self.nodes)
-        self.face_id = self._identities("element_id", len(self.faces))
-        self.fields = self._fields()
-        self.curves = self._curves()
-        self.left_out = self._left_out()
-        used = () if mesh is None or "faces" in self.file[self.group] else (mesh,)
-        self.files = (path, *used, *sorted(set().union(*self._behind.values())))
-        unit = _text(self.displacements.attrs.get("units", ""))
-        self.units = "SI" if unit in _METRE else None
+        with closed_if_refused(self.file):
+            self._behind: dict[str, set[Path]] = {}
+            self.notes: tuple[str, ...] = ()
+            group = _group(self.file)
+            if group is None:
+                raise ReadError(
+                    f"{path}: no group with datasets {' and '.join(_NEEDED)}; found {', '.join(self.file) or 'nothing'}"
+                )
+            self.group = group
+            self.displacements = self._dataset("displacements", 4)
+            self.runs, self.states, self.nodes, xyz = self.displacements.shape
+            if xyz != 3 or 0 in self.displacements.shape:
+                raise self._wrong("displacements", "(run, state, node, 3), none of them 0")
+            self.reference = self._dataset("reference_configuration", 2, 3)
+            if self.reference.shape[-2:] != (self.nodes, 3) or self.reference.shape[:-2] not in ((), (self.runs,)):
+                raise self._wrong("reference_configuration", f"({self.runs}, {self.nodes}, 3)")
+            self.faces = self._faces(mesh)
+            self.time = self._time(step)
+            self.parameters = self._parameters()
+            self.numbers = self._numbers()
+            self.alive = self._if_there("alive", (self.runs, self.states, len(self.faces)))
+            self.parts, self.face_part = self._parts()
+            self.node_id = self._identities("node_id", self.nodes)
+            self.face_id = self._identities("element_id", len(self.faces))
+            self.fields = self._fields()
+            self.curves = self._curves()
+            self.left_out = self._left_out()
+            used = () if mesh is None or "faces" in self.file[self.group] else (mesh,)
+            self.files = (path, *used, *sorted(set().union(*self._behind.values())))
+            unit = _text(self.displacements.attrs.get("units", ""))
+            self.units = "SI" if unit in _METRE else None
 
     def name(self, index: int) -> str:
         number = int(self.numbers[index])

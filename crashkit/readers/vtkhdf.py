@@ -24,7 +24,7 @@ from crashkit.readers._grid import Grid, GridSource, Place
 from crashkit.readers._grid_run import GridRun
 from crashkit.readers._hdf5_data import SIGNATURE, files_behind
 from crashkit.readers.base import Run, Runs
-from crashkit.readers.checks import LIBRARY_ERRORS, reading, require_options
+from crashkit.readers.checks import LIBRARY_ERRORS, closed_if_refused, reading, require_options
 
 _GRIDS = ("UnstructuredGrid", "PolyData")
 _COLLECTIONS = ("PartitionedDataSetCollection", "MultiBlockDataSet")
@@ -227,25 +227,28 @@ class _Steps(GridSource):
 
         self.file, self.files = file, (file,)
         self._opened = h5py.File(file, "r", rdcc_nbytes=_CHUNK_CACHE)
-        root = self._opened.get("VTKHDF")
-        kind = _kind(root) if isinstance(root, h5py.Group) else ""
-        if kind in _COLLECTIONS:
-            groups = [g for g in root.values() if isinstance(g, h5py.Group) and _kind(g) in _GRIDS]
-        elif kind in _GRIDS:
-            groups = [root]
-        else:
-            groups = []
-        if not groups:
-            raise ReadError(f"{file}: holds VTKHDF type {kind or 'nothing'}, expected {' or '.join(_GRIDS)} with Steps")
-        self._parts = [_Part(file, group) for group in groups]
-        self.time = self._parts[0].time
-        for part in self._parts:
-            if not np.array_equal(part.time, self.time):
-                raise ReadError(f"{file}: part {part.name} has other times than part {self._parts[0].name}")
+        with closed_if_refused(self._opened):
+            root = self._opened.get("VTKHDF")
+            kind = _kind(root) if isinstance(root, h5py.Group) else ""
+            if kind in _COLLECTIONS:
+                groups = [g for g in root.values() if isinstance(g, h5py.Group) and _kind(g) in _GRIDS]
+            elif kind in _GRIDS:
+                groups = [root]
+            else:
+                groups = []
+            if not groups:
+                raise ReadError(
+                    f"{file}: holds VTKHDF type {kind or 'nothing'}, expected {' or '.join(_GRIDS)} with Steps"
+                )
+            self._parts = [_Part(file, group) for group in groups]
+            self.time = self._parts[0].time
+            for part in self._parts:
+                if not np.array_equal(part.time, self.time):
+                    raise ReadError(f"{file}: part {part.name} has other times than part {self._parts[0].name}")
 
-        for part in self._parts:
-            part.require_present()
-        self.files = (file, *sorted(set().union(*(part.files for part in self._parts))))
+            for part in self._parts:
+                part.require_present()
+            self.files = (file, *sorted(set().union(*(part.files for part in self._parts))))
 
     def place(self, state: int) -> str:
         return f"{self.file}, state {state}"

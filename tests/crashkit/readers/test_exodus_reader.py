@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import h5py
 import netCDF4
 import numpy as np
 import pytest
@@ -242,3 +243,19 @@ def test_zeros_behind_a_classic_file_are_no_damage(tmp_path, sample, only_run):
     assert only_run(path).problems == ()
     path.write_bytes(path.read_bytes() + b"\1" * 8)
     assert "bytes behind its last variable" in only_run(path).problems[0]
+
+
+@pytest.mark.parametrize("change", ["no displacement", "no times"])
+def test_a_file_that_is_refused_is_closed_again(tmp_path, sample, change):
+    path = write_exodus(tmp_path / "kart.e", sample, "hdf5")
+    with netCDF4.Dataset(path, "a") as file:
+        if change == "no times":
+            file.renameVariable("time_whole", "other")
+        else:
+            file["name_nod_var"][:] = np.array(
+                [[c.encode() for c in f"TEMP_{k}".ljust(33, "\0")] for k in range(3)], "S1"
+            )
+    before = h5py.h5f.get_obj_count(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE)
+    with pytest.raises(ReadError) as caught:
+        next(reader_for(path).runs(path))
+    assert h5py.h5f.get_obj_count(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE) == before, caught.value
