@@ -182,7 +182,9 @@ def _times(text: str) -> list[float] | None:
     try:
         times = [duration(piece) for piece in text.split(",")] if text else []
     except UnknownUnits as error:
-        raise typer.BadParameter(f"{error}; expected such as 15ms or 0,0.01,0.02", param_hint="--time") from error
+        raise typer.BadParameter(
+            f"{error}; expected seconds, or times with a unit, such as 15ms or 0,0.01,0.02", param_hint="--time"
+        ) from error
     if any(b <= a for a, b in itertools.pairwise(times)):
         raise typer.BadParameter(f"{text!r}; expected increasing times, each once", param_hint="--time")
     return times or None
