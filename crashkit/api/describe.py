@@ -228,6 +228,7 @@ def describe_model(surrogate: Surrogate, path: Path) -> dict[str, Any]:
             for name, number in surrogate.level_names.items()
         ],
         "choice": record.choice,
+        "coarse": record.physics.get("coarse runs", ""),
         "notes": list(record.notes),
     }
 
@@ -240,7 +241,7 @@ def describe_training(surrogate: Surrogate, output: Path) -> dict[str, Any]:
         "validation_errors_m": record.errors, "training_runs": record.fitted_runs,
         "validation_runs": record.validation_runs, "held_out_runs": record.held_out_runs,
         "seeds": surrogate.seeds, "errors_of_each_seed_m": record.members,
-        "physics": record.physics, "notes": record.notes,
+        "physics": record.physics, "coarse": record.coarse, "notes": record.notes,
         "removal": None if surrogate.removal is None else {k: vars(v) for k, v in surrogate.removal.scores.items()},
         "fields": {name: known.errors for name, known in surrogate.fields.items()},
     }  # fmt: skip

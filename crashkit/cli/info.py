@@ -116,6 +116,8 @@ def _print_model(found: dict[str, Any]) -> None:
     out.print(f"  dataset     {found.get('dataset', 'unknown')}, checksum {found['checksum'][:12]}", markup=False)
     runs = [f"{len(found[k])} {what}" for k, what in _SPLIT if found[k]]
     out.print(f"  runs        {', '.join(runs)}", markup=False)
+    if found["coarse"]:
+        out.print(f"  coarse runs {found['coarse']}", markup=False)
     span = f"{_shown(found['time_begin'], 's')} to {_shown(found['time_end'], 's')}"
     out.print(f"  states      {found['states']}, {span}; full mesh {found['nodes']} nodes", markup=False)
     _print_parameters(found["parameters"])

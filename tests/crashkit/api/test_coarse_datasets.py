@@ -13,6 +13,7 @@ import crashkit
 from crashkit.api.model import Model
 from crashkit.cli import app
 from crashkit.errors import DataError
+from crashkit.writers.d3plot import write_d3plot
 from surrogates.errors import SurrogateError
 
 TIME = np.linspace(0.0, 0.02, 6)
@@ -107,6 +108,13 @@ def test_a_prediction_starts_from_a_run_of_a_dataset(model: Model, tmp_path: Pat
     assert error < 0.01 * np.linalg.norm(true, axis=-1).mean()
     assert np.abs(alone - said["displacement"].values).max() > 0  # another way to say it
     assert (said["half_width"].values >= 0).all()
+
+
+def test_a_prediction_starts_from_the_folder_of_a_solver(model: Model, tmp_path: Path) -> None:
+    run = dataset(5, range(71, 72))
+    write_d3plot(run.isel(sim=0), tmp_path / "d3plot", None, "coarse 71")
+    one, other = (model.predict(at(71), coarse_run=r)["displacement"].values for r in (run, tmp_path / "d3plot"))
+    np.testing.assert_allclose(one, other, atol=1e-6)
 
 
 def test_nodes_of_the_run_are_matched_by_number(model: Model) -> None:

@@ -10,12 +10,15 @@ import numpy as np
 import plate
 import pytest
 from numpy.typing import NDArray
+from scipy import sparse
 
 from surrogates.data.campaign import CoarseRuns
 from surrogates.errors import ModelFolderError, SurrogateError
 from surrogates.models.coarse_fit import ALONE, OF_QUERY
 from surrogates.models.pod_regression import PodRegression
+from surrogates.queries.points import AtPoints
 from surrogates.settings import settings
+from surrogates.storage.browser import browsable
 from surrogates.storage.card import card
 from surrogates.storage.folder import load, save
 from surrogates.surrogate import Surrogate
@@ -147,6 +150,19 @@ def test_at_training_runs_the_fold_knows_no_coarse_run_of_its_own(helped: Surrog
     errors = helped.record.coarse["errors"]
     assert errors[OF_QUERY] != errors[helped.record.coarse["way"]]
     assert helped.record.coarse["twins"] == 10
+
+
+def test_points_are_predicted_as_the_whole_mesh_is(helped: Surrogate) -> None:
+    mu = plate.parameters(3, seed=9)
+    nodes = np.array([3, 40, 77])
+    where = sparse.csr_matrix((np.ones(3), (np.arange(3), nodes)), shape=(3, 81))
+    found = AtPoints(helped, where, plate.TIME)(mu)
+    np.testing.assert_allclose(found, helped.predict(mu)[:, :, nodes], atol=1e-5)
+
+
+def test_a_page_with_sliders_says_that_it_cannot(helped: Surrogate) -> None:
+    with pytest.raises(SurrogateError, match="no form for a browser"):
+        browsable(helped, "m", "m_")
 
 
 def test_other_models_refuse_coarse_runs() -> None:
