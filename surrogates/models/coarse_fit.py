@@ -154,7 +154,8 @@ class _Search:
         own, images = _coefficients(coarse, trials, registration, turn, settings, notes)
         parameters = coarse.campaign.parameters
         mirrored = registration.symmetry.images(parameters, registration.inputs.names)
-        inputs = registration.read(parameters)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            inputs = registration.read(parameters)
         keep = np.flatnonzero(np.isfinite(inputs).all(axis=1))
         if len(keep) < len(parameters):
             notes.add(
@@ -164,10 +165,10 @@ class _Search:
             raise SurrogateError(f"there are {len(keep)} coarse runs; expected at least {_FEWEST}")
         self.count, sets, courses = len(keep), [inputs[keep]], [self._registered(own, parameters, keep)]
         if images is not None:
-            beside = registration.read(mirrored)
+            beside = registration.read(mirrored[keep])
             if registration.symmetry.flagged:
                 beside[:, -1] = 1.0
-            sets.append(beside[keep])
+            sets.append(beside)
             courses.append(self._registered(images, parameters, keep))
         self.below = np.concatenate(courses)
         self.x = self._scaled(np.concatenate(sets))
@@ -196,9 +197,10 @@ class _Search:
         )
         share = _UNKNOWN
         if twins >= _TWINS:
-            of_share = {s: self._errors(folds, self._from_itself(way, s))[self.twin >= 0].mean() for s in _SHARES}
-            share = min(of_share, key=lambda tried: float(of_share[tried]))
-            told[OF_QUERY] = float(of_share[share])
+            has = self.twin >= 0
+            of_share = {s: float(np.nanmean(self._errors(folds, self._from_itself(way, s))[has])) for s in _SHARES}
+            share = min(of_share, key=lambda tried: of_share[tried])
+            told[OF_QUERY] = of_share[share]
         slopes = _both(_sum_of([sums for _, sums, _ in folds]))
         base, values = self._base(way, slopes, apart, count, share)
         held = [one for fold, _, fitted in folds for one in self._held(fold, way, fitted, count, share)]
@@ -215,10 +217,9 @@ class _Search:
         kept = [np.ascontiguousarray(courses[..., :count]) for courses in left]
         beside = (apart, kept[1]) if any(kind for kind, _, _ in _TERMS[way]) else None
         below = np.ascontiguousarray((total * self.below)[..., :count], np.float32)
-        where = _labelled(self.coarse)
-        return CoarseBase(self.process, below, total[:count].copy(), self.coarse.to_fine, *where, share, beside), kept[
-            0
-        ]
+        slope, where = total[:count].copy(), _labelled(self.coarse)
+        base = CoarseBase(self.process, below, slope, self.coarse.to_fine, *where, share, beside)
+        return base, kept[0]
 
     def _registered(
         self, courses: list[Courses3], parameters: NDArray[np.float64], keep: NDArray[np.int64]
@@ -262,6 +263,7 @@ class _Search:
             twins = self.twin[held]
             gone = twins[twins >= 0]
             left = np.setdiff1d(np.arange(len(self.x)), np.concatenate([gone, gone + self.count]))
+            left = left if len(left) else np.arange(len(self.x))  # a handful of coarse runs, all of this fold
             far = Gaussian(self.x[left], self.process.kernel).weights(inputs[held])
             yield _Fold(
                 held, (_weighted(weights[0], fine), _weighted(weights[1], fine)),

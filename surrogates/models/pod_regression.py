@@ -257,7 +257,8 @@ def with_coarse(fit: PodFit, coarse: CoarseRuns, settings: Settings, notes: Note
         count = min(max(settings.pod.modes), most)
         found = fit_coarse(coarse, trials, registration, fit.plane, every, count, settings, notes)
     if found.base is None or found.machine is None or found.values is None:
-        notes.add("coarse runs did not lower the error in cross-validation: the fine runs alone are kept")
+        why = "did not lower the error in cross-validation" if found.errors else "cannot be judged by so few fine runs"
+        notes.add(f"coarse runs {why}: the fine runs alone are kept")
         return replace(fit, coarse=found)
     old, modes = fit.core, np.ascontiguousarray(trials.courses.modes @ every[:, :count])
     data = Coefficients(old.data.parameters, old.data.time, found.values)
