@@ -8,7 +8,8 @@ by the expected reduction of the error over the box (`surrogates.design.criteria
 over the runs chosen so far. Against it stand random subsets (the same starts, filled up at random) and blocks of consecutive
 runs of the pool, which is a Halton sequence: one prefix may be lucky, so the mean over blocks counts. The error is the mean
 node distance over runs that nobody chooses: `--judged`, or with `--folds` a quarter of the pool that is left out of each
-start's pool in turn. The estimate of `crashkit campaign` at the last count is compared with that error.
+start's pool in turn. The estimate of `crashkit campaign` at the last count is compared with that error. With `--json`
+the same call goes on where an interrupted one stopped.
 """
 
 from __future__ import annotations
@@ -33,6 +34,10 @@ from surrogates.settings import settings
 from surrogates.surrogate import Surrogate
 from surrogates.training.train import train_surrogate
 
+METHODS = ("random", "halton", "expected-reduction")
+# Starts that are drawn to say how sure a mean over starts is.
+_RESAMPLES = 4000
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -41,7 +46,7 @@ def main() -> None:
     parser.add_argument("--pool", default="", help="runs to choose among, ranges with commas; default: all others")
     parser.add_argument("--folds", action="store_true", help="judge each start on a quarter of the pool")
     parser.add_argument("--every", type=int, default=1, help="take every so many states")
-    parser.add_argument("--starts", type=int, default=10)
+    parser.add_argument("--starts", default="10", help="how many, or which: 4:6")
     parser.add_argument("--first", type=int, default=16)
     parser.add_argument("--batch", type=int, default=8)
     parser.add_argument("--counts", type=int, nargs="+", default=[24, 48])
@@ -53,7 +58,10 @@ def main() -> None:
     whole = open_campaign(source_of(args.dataset), symmetry=True)
     memory = np.stack([np.asarray(whole.displacement(0)[k]) for k in range(len(whole.parameters))])
     memory = np.ascontiguousarray(memory[:, :: args.every])
-    whole = replace(whole, displacement=lambda level: memory, time=whole.time[:: args.every])
+    whole = replace(  # displacements alone, so that a subset of the runs needs nothing else
+        whole, displacement=lambda level: memory, time=whole.time[:: args.every], known=None, alive=None, targets=(),
+        curves=(),
+    )  # fmt: skip
     names = list(whole.runs)
     judged = runs_of(names, args.judged) if args.judged else []
     pool = (
@@ -61,8 +69,11 @@ def main() -> None:
     )
     pool = [k for k in pool if k not in set(judged)]
     replay = Replay(whole, memory, args.odd, args.batch, args.local)
-    out: dict[str, Any] = {"random": {}, "halton": {}, "expected-reduction": {}, "estimate": []}
-    for start in range(args.starts):
+    out: list[dict[str, Any]] = json.loads(args.json.read_text()) if args.json and args.json.exists() else []
+    begin, _, end = args.starts.rpartition(":")
+    for start in range(int(begin or 0), int(end)):
+        if any(row["start"] == start for row in out):
+            continue
         rng = np.random.default_rng(start)
         fold = judged
         own = pool
@@ -71,14 +82,12 @@ def main() -> None:
             fold = sorted(parts[start % 4].tolist())
             own = [k for k in pool if k not in set(fold)]
         first = rng.choice(own, args.first, replace=False).tolist()
-        for method in ("random", "halton", "expected-reduction"):
-            for count, (error, estimate) in replay.course(method, first, own, fold, args.counts, start).items():
-                out[method].setdefault(count, []).append(error)
-                if method == "expected-reduction" and count == max(args.counts):
-                    out["estimate"].append([error, *estimate])
+        row = {m: replay.course(m, first, own, fold, args.counts, start) for m in METHODS}
+        out.append({"start": start, **row})
         show(out, args.counts)
         if args.json:
             args.json.write_text(json.dumps(out))
+    show(out, args.counts)
 
 
 class Replay:
@@ -91,11 +100,12 @@ class Replay:
 
     def course(
         self, method: str, first: list[int], pool: list[int], judged: list[int], counts: list[int], start: int
-    ) -> dict[int, tuple[float, tuple[float, float, float]]]:
-        """Error (m), and the estimate with its 90 % interval, at each of `counts` runs."""
+    ) -> dict[str, list[float]]:
+        """Error (m), and the estimate with its 90 % interval (m), at each of `counts` runs."""
         rng = np.random.default_rng(1000 + start)
         rest = [k for k in pool if k not in set(first)]
-        chosen, out = list(first), {}
+        chosen = list(first)
+        out: dict[str, list[float]] = {}
         if method == "random":
             chosen += rng.permutation(rest)[: max(counts) - len(first)].tolist()
         if method == "halton":
@@ -104,11 +114,11 @@ class Replay:
         while True:
             done = method != "expected-reduction"
             for count in counts if done else [len(chosen)]:
-                if count in counts or not done:
-                    surrogate = self.trained(chosen[:count])
-                    if count in counts:
-                        judgement = TrainedProcess.of(surrogate, self.box).judge(0.9)
-                        out[count] = (self.error(surrogate, judged), (judgement.error, judgement.low, judgement.high))
+                surrogate = self.trained(chosen[:count])
+                if count in counts:
+                    judged_by_itself = TrainedProcess.of(surrogate, self.box).judge(0.9)
+                    estimate = (judged_by_itself.error, judged_by_itself.low, judged_by_itself.high)
+                    out[str(count)] = [self.error(surrogate, judged), *estimate]
             if done or len(chosen) >= max(counts):
                 return out
             chosen += self.ask(surrogate, chosen, pool)
@@ -140,22 +150,29 @@ class Replay:
         return float(np.mean(errors))
 
 
-def show(out: dict[str, Any], counts: list[int]) -> None:
-    """The table so far, in mm, with the standard error of the mean over starts."""
-    print(f"{len(out['random'][counts[0]])} starts, mean error in mm (standard error), ratios to random and Halton")
+def show(out: list[dict[str, Any]], counts: list[int]) -> None:
+    """The table so far, in mm, with 90 % intervals over starts."""
+    print(f"{len(out)} starts, mean error in mm; ratios to random and to Halton with 90 % intervals over starts")
     for count in counts:
-        means = {m: np.mean(out[m][count]) for m in ("random", "halton", "expected-reduction")}
-        cells = [
-            f"{m} {1e3 * means[m]:.2f} ({1e3 * np.std(out[m][count]) / np.sqrt(len(out[m][count])):.2f})" for m in means
-        ]
-        asked = means["expected-reduction"]
-        print(f"{count:4d} runs: {', '.join(cells)}; {asked / means['random']:.3f}, {asked / means['halton']:.3f}")
-    found = np.array(out["estimate"])
-    ratio, inside = found[:, 1] / found[:, 0], (found[:, 2] <= found[:, 0]) & (found[:, 0] <= found[:, 3])
-    print(
-        f"estimate / true: {ratio.mean():.3f} +- {ratio.std():.3f}; 90 % interval holds {inside.sum()} of {len(inside)}",
-        flush=True,
-    )
+        errors = {m: np.array([start[m][str(count)][0] for start in out]) for m in METHODS}
+        asked = errors["expected-reduction"]
+        means = ", ".join(f"{m} {1e3 * errors[m].mean():.2f}" for m in METHODS)
+        print(f"{count:4d} runs: {means}; {_ratio(asked, errors['random'])}, {_ratio(asked, errors['halton'])}")
+    for method in METHODS:
+        true, said, low, high = np.array([start[method][str(max(counts))] for start in out]).T
+        inside = (low <= true) & (true <= high)
+        print(
+            f"{max(counts)} runs, {method}: estimate / true {(said / true).mean():.3f} +- {(said / true).std():.3f}, from "
+            f"{(said / true).min():.2f} to {(said / true).max():.2f}; 90 % interval holds {inside.sum()} of {len(inside)}",
+            flush=True,
+        )
+
+
+def _ratio(asked: NDArray[np.float64], others: NDArray[np.float64]) -> str:
+    """The ratio of means, with its 90 % interval by drawing starts anew."""
+    draws = np.random.default_rng(0).integers(0, len(asked), (_RESAMPLES, len(asked)))
+    low, high = np.quantile(asked[draws].mean(axis=1) / others[draws].mean(axis=1), [0.05, 0.95])
+    return f"{asked.mean() / others.mean():.3f} ({low:.3f} to {high:.3f})"
 
 
 if __name__ == "__main__":
