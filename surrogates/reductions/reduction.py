@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal, TypeAlias
 
 import numpy as np
 import torch
@@ -19,6 +20,8 @@ from surrogates.operators.graph import GraphOperator
 from surrogates.operators.stacks import GraphDecoder, GraphEncoder
 from surrogates.regression.network import fully_connected
 from surrogates.settings import REDUCTIONS, LevelSettings
+
+Part: TypeAlias = Literal["encoder", "decoder"]
 
 
 class Reduction(nn.Module):
@@ -39,6 +42,10 @@ class Reduction(nn.Module):
     def end_at_zero(self) -> None:
         """Give zero in both directions until training moves it, beside a linear part (only `level.start=pod` needs it)."""
         raise SurrogateError(f"{type(self).__name__} cannot stand beside a linear part; set level.start=plain")
+
+    def last_layer(self, part: Part) -> nn.Module | None:
+        """The layer that `end_at_zero` sets to zero, without which this part gives zero; None where there is no such one."""
+        return None
 
 
 @dataclass(frozen=True)
@@ -77,9 +84,12 @@ class GraphReduction(Reduction):
 
     def end_at_zero(self) -> None:
         """Both ends at zero: what stands beside this reduction is all there is, until training moves it."""
-        for layer in (self.encoder.dense, _last_layer(self.decoder)):
+        for layer in (self.last_layer("encoder"), self.last_layer("decoder")):
             for parameter in layer.parameters():
                 nn.init.zeros_(parameter)
+
+    def last_layer(self, part: Part) -> nn.Module:
+        return self.encoder.dense if part == "encoder" else _last_layer(self.decoder)
 
     def decode_only(self) -> None:
         del self.encoder
@@ -102,9 +112,12 @@ class DenseReduction(Reduction):
         return unflat(self.decoder(z), self.n_nodes)
 
     def end_at_zero(self) -> None:
-        for network in (self.encoder, self.decoder):
-            for parameter in network[-1].parameters():
+        for layer in (self.last_layer("encoder"), self.last_layer("decoder")):
+            for parameter in layer.parameters():
                 nn.init.zeros_(parameter)
+
+    def last_layer(self, part: Part) -> nn.Module:
+        return (self.encoder if part == "encoder" else self.decoder)[-1]
 
     def decode_only(self) -> None:
         del self.encoder
@@ -157,11 +170,28 @@ class SumReduction(Reduction):
         remainder.end_at_zero()
 
     def encode(self, x: Tensor) -> Tensor:
-        return self.linear.encode(x) + self.remainder.encode(x)
+        linear = self.linear.encode(x)
+        return linear if self._untrained("encoder") else linear + self.remainder.encode(x)
 
     def decode(self, z: Tensor) -> Tensor:
-        nonlinear = self.remainder.decode(z)
+        if self._untrained("decoder"):
+            nonlinear = z.new_zeros(self.linear.n_nodes, 3, len(z)).transpose(1, 2)
+        else:
+            nonlinear = self.remainder.decode(z)
         return self.linear.decode(z) + nonlinear if torch.is_grad_enabled() else self.linear.added(nonlinear, z)
+
+    def _untrained(self, part: Part) -> bool:
+        """Whether this part of the remainder still gives zero, so that it need not be computed.
+
+        Only without gradients and on a CPU, where weights can be looked at; what is exported has everything.
+        """
+        if torch.is_grad_enabled() or torch.compiler.is_compiling() or torch.compiler.is_exporting():
+            return False
+        last = self.remainder.last_layer(part)
+        if last is None or self.linear.offset.device.type != "cpu":
+            return False
+        # The first number of a trained layer tells already; all are looked at only where it is zero.
+        return all(not bool(p.flatten()[0]) and not bool(p.any()) for p in last.parameters())
 
     def decode_only(self) -> None:
         self.linear.decode_only()
