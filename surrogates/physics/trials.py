@@ -32,7 +32,7 @@ _log = logging.getLogger(__name__)
 
 # Modes of the common basis, and numbers a field of that many modes may hold at most.
 MODES = 128
-_NUMBERS = 3e8
+_NUMBERS = 1.6e8
 # Singular values below this share of the largest are rounding.
 _SMALLEST = 1e-5
 _TRANSLATIONS = 3
