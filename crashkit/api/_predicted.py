@@ -178,7 +178,8 @@ class PredictedRuns(GivenRuns):
         if not self._share or known.band is None:
             return found
         size = abs(self._share)
-        off = known.half_width(max(size, 0.5)) * min(1.0, size / 0.5) * np.sign(self._share)
+        width = known.half_width(max(size, 0.5), self._surrogate.registration, self.parameters)
+        off = width * min(1.0, size / 0.5) * np.sign(self._share)
         return Value(found.array + off, found.axes, found.time, found.unit)
 
     @property

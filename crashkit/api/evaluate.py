@@ -244,10 +244,10 @@ def _beside(source: Source, result: Evaluation, tell: Progress) -> Beside | None
             curve = surrogate.curves[name]
             said_curves = surrogate.predict_curve(name, parameters[label])
             predictions[label] = np.stack([np.interp(time, curve.time, c) for c in said_curves])
-            width_known = curve.band is not None
-            widths[label] = (
-                np.interp(time, curve.time, curve.half_width(SHARE)) if width_known else np.full(len(time), np.nan)
-            )
+            widths[label] = np.full(predictions[label].shape, np.nan)
+            if curve.band is not None:
+                of_runs = curve.half_width(SHARE, surrogate.registration, parameters[label])
+                widths[label] = np.stack([np.interp(time, curve.time, width) for width in of_runs])
         curves_compared.append(CurveCompared(name, unit, time, truth, predictions, widths))
     compared = tuple(NumberCompared(*key, *found) for key, found in numbers.items())
     return Beside(result.test_names, compared, tuple(curves_compared))

@@ -356,8 +356,8 @@ class Model:
             "channel_unit": ("channel", [curve.unit for curve in curves.values()]),
         }
         if band is not None and all(curve.band is not None for curve in curves.values()):
-            widths = np.stack([curve.half_width(band) for curve in curves.values()], axis=-1)
-            out["history_half_width"] = (("sample", "channel"), widths)
+            of_runs = [curve.half_width(band, self.surrogate.registration, values) for curve in curves.values()]
+            out["history_half_width"] = (("sim", "sample", "channel"), np.stack(of_runs, axis=-1))
         return out
 
     def _numbers(self, values: NDArray[np.float64], band: float | None, level: int) -> dict[str, Any]:

@@ -58,7 +58,7 @@ class CurveCompared:
     truth
         (run, sample), NaN where a run lacks it.
     predictions, half_width
-        Model -> (run, sample), and (sample,), NaN where a model has no band.
+        Model -> (run, sample) both, NaN where a model has no band.
     """
 
     name: str

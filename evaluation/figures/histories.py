@@ -56,7 +56,7 @@ class HistoriesFigure:
             time = curve.time * MS
             ax.plot(time, truth, color=INK, linewidth=2.0, label="truth")
             for model, values in curve.predictions.items():
-                style, width = sheet.style(model), curve.half_width[model] * factor
+                style, width = sheet.style(model), curve.half_width[model][run] * factor
                 if np.isfinite(width).all():
                     said = values[run] * factor
                     ax.fill_between(time, said - width, said + width, color=style.colour, alpha=0.18, linewidth=0)

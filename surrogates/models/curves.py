@@ -22,7 +22,7 @@ from surrogates.errors import SurrogateError
 from surrogates.physics.registration import Registration
 from surrogates.physics.trials import Folds
 from surrogates.regression.gaussian import Gaussian
-from surrogates.uncertainty import FEWEST_BY_FOLDS, Band, calibrate
+from surrogates.uncertainty import FEWEST_BY_FOLDS, Band, Beliefs, calibrate
 
 Floats = NDArray[np.float64]
 
@@ -30,6 +30,10 @@ Floats = NDArray[np.float64]
 _ENERGY, _FEWEST = 0.9995, 3
 # Another way to read the parameters is chosen if it lowers the error by this share.
 _MARGIN = 0.01
+# Share of the usual size that is added to that of a run, as the root of squares: no band is without width.
+_FLOOR = 0.05
+# What a curve's band may follow.
+_SPREADS = ("constant", "size", "deviation")
 
 
 @dataclass
@@ -73,9 +77,7 @@ class Curve:
 
     def predict(self, registration: Registration, parameters: Floats) -> Floats:
         """(run, sample) for parameters (run, parameter)."""
-        inputs = registration.read(parameters) if self.registered else parameters
-        x = over_range(inputs, np.stack([self.low, self.high]))
-        found = self.machine.weights(x) @ self.values @ self.modes
+        found = self.machine.weights(self._read(registration, parameters)) @ self.values @ self.modes
         if not self.clock:
             return np.asarray(found)
         return np.stack(
@@ -85,8 +87,24 @@ class Curve:
             ]
         )
 
-    def half_width(self, coverage: float) -> Floats:
-        """(sample,): the share `coverage` of samples of a new run lies as near.
+    def _read(self, registration: Registration, parameters: Floats) -> Floats:
+        """(run, input) of the process, scaled."""
+        inputs = registration.read(parameters) if self.registered else parameters
+        return over_range(inputs, np.stack([self.low, self.high]))
+
+    def beliefs(self, registration: Registration, parameters: Floats) -> Beliefs:
+        """What is said of runs before they are computed: how large their curves are, and the process's own deviation."""
+        size = np.sqrt(np.square(self.predict(registration, parameters)).mean(axis=1))
+        usual = float(np.sqrt(np.square(self.values @ self.modes).mean()))
+        deviation = self.machine.deviation(self._read(registration, parameters))
+        return Beliefs(np.hypot(size, _FLOOR * max(usual, 1e-30)), deviation)
+
+    def half_width(
+        self, coverage: float, registration: Registration | None = None, parameters: Floats | None = None
+    ) -> Floats:
+        """(sample,): the share `coverage` of samples of a new run lies as near; of a typical run.
+
+        With `registration` and `parameters` (run, parameter): (run, sample), of these runs.
 
         Raises
         ------
@@ -95,7 +113,10 @@ class Curve:
         """
         if self.band is None:
             raise SurrogateError(f"there is no band for {self.name}: it takes {FEWEST_BY_FOLDS} training runs")
-        return np.asarray(self.band.half_width(coverage, self.time)[:, 0], np.float64)
+        typical = np.asarray(self.band.half_width(coverage, self.time)[:, 0], np.float64)
+        if registration is None or parameters is None:
+            return typical
+        return np.asarray(self.band.of_runs(self.beliefs(registration, parameters))[:, None] * typical)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """What has to be kept."""
@@ -112,6 +133,7 @@ class Curve:
         return {
             "unit": self.unit, "registered": self.registered, "clock": self.clock, "errors": self.errors,
             "runs": 0 if self.band is None else self.band.runs,
+            **({} if self.band is None else {"spread": self.band.spread, "spread_unit": self.band.unit}),
         }  # fmt: skip
 
     @classmethod
@@ -120,7 +142,13 @@ class Curve:
         machine = Gaussian.load(a["x"], a)
         band = None
         if "band_node" in a:
-            band = Band(a["band_node"], a["band_state"], a["time"], a["band_factor"], int(told["runs"]))
+            spread = told.get("spread", "constant")
+            if spread not in _SPREADS:
+                raise SurrogateError(f"the band of {name} follows {spread!r}; expected {', '.join(_SPREADS)}")
+            band = Band(
+                a["band_node"], a["band_state"], a["time"], a["band_factor"], int(told["runs"]), spread,
+                float(told.get("spread_unit", 1.0)),
+            )  # fmt: skip
         return cls(
             name, str(told["unit"]), a["time"], bool(told["registered"]), bool(told["clock"]), a["grid"], a["low"],
             a["high"], a["modes"], a["values"], machine, band, {str(k): float(v) for k, v in told["errors"].items()},
@@ -173,19 +201,24 @@ def fit_curve(
     parts = Folds.of(len(whole), folds, seed)
     errors: dict[str, float] = {}
     held: dict[_Way, dict[int, list[Floats]]] = {}
+    doubted: dict[_Way, dict[int, Beliefs]] = {}
     mirrors = not registration.symmetry.is_identity
 
     def judge(way: _Way) -> None:
         said: dict[int, list[Floats]] = {}
+        believed: dict[int, Beliefs] = {}
         for train, left in parts:
             if not len(left):
                 continue
             fitted = _fitted(target, time, curves[train], runs[train], registration, way, seed, names)
             for run, curve in zip(left, fitted.predict(registration, runs[left]), strict=True):
                 said.setdefault(int(run), []).append(curve)
+            beliefs = fitted.beliefs(registration, runs[left])
+            for place, run in enumerate(left):
+                believed[int(run)] = Beliefs(beliefs.size[place : place + 1], beliefs.deviation[place : place + 1])
         wrong = [np.square(c - curves[run]).mean() for run, found in said.items() for c in found]
         errors[way.told] = float(np.sqrt(np.mean(wrong))) if wrong else float("nan")
-        held[way] = said
+        held[way], doubted[way] = said, believed
 
     best = ways[0]
     for way in ways:
@@ -198,7 +231,9 @@ def fit_curve(
     out.errors = {**errors, "chosen": errors[best.told]}
     out.held = {int(whole[run]): np.mean(found, axis=0) for run, found in held[best].items()}
     if len(held[best]) >= FEWEST_BY_FOLDS:
-        out.band = calibrate(_distances(held[best], curves), time)
+        known = [doubted[best][run] for run in held[best]]
+        beliefs = Beliefs(np.concatenate([b.size for b in known]), np.concatenate([b.deviation for b in known]))
+        out.band = calibrate(_distances(held[best], curves), time, beliefs)
     return out
 
 

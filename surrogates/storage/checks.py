@@ -150,6 +150,8 @@ def check_curves(curves: Mapping[str, Curve]) -> None:
             numbers("node", curve.band.node, (1,))
             numbers("state", curve.band.state, (samples,))
             numbers("factor", curve.band.factor, (len(SHARES),))
+            if not (np.isfinite(curve.band.unit) and curve.band.unit > 0):
+                raise SurrogateError(f"the band of {name} has the unit {curve.band.unit}; expected a number above 0")
 
 
 def check_bands(bands: Mapping[tuple[int, bool], Band], graphs: Graphs, record: Record) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from surrogates.data.campaign import CurveTarget
 from surrogates.errors import ModelFolderError, SurrogateError
-from surrogates.models.curves import fit_curve
+from surrogates.models.curves import Curve, fit_curve
 from surrogates.physics.registration import Registration
 from surrogates.settings import settings
 from surrogates.storage.folder import load, save
@@ -57,6 +57,24 @@ def test_its_band_holds_what_it_says(surrogate: Surrogate) -> None:
         off = np.abs(surrogate.predict_curve(true.name, new) - true.values)
         assert 0.75 < (off <= curve.half_width(0.9)).mean() <= 1
         assert (curve.half_width(0.5) <= curve.half_width(0.9)).all()
+        assert 0.8 < (off <= curve.half_width(0.9, surrogate.registration, new)).mean() <= 1
+
+
+def test_its_band_follows_the_size_of_a_run_where_errors_do() -> None:
+    """Errors in proportion to the curve: with one width for all, small runs would be held too often and large ones too seldom."""
+    rng = np.random.default_rng(0)
+    size = 10 ** rng.uniform(0, 2, 60)
+    wave = np.sin(np.linspace(0.1, 3, 40)) * (1 + 0.1 * rng.standard_normal((60, 40)).cumsum(axis=1) / 6)
+    target = CurveTarget("force", "N", size[:, None] * wave)
+    runs = np.log10(size)[:, None]
+    identity = Registration.identity(("a",), plate.TIME)
+    found = fit_curve(target, np.linspace(0, 1, 40), runs, identity, 5, 0)
+    assert found.band is not None
+    assert found.band.spread == "size"
+    small, large = found.half_width(0.9, identity, np.array([[0.3], [1.8]])).mean(axis=1)
+    assert large > 5 * small
+    back = Curve.load("force", found.told(), found.arrays())
+    np.testing.assert_allclose(back.half_width(0.9, identity, runs), found.half_width(0.9, identity, runs))
 
 
 def test_channels_are_named_by_pattern_and_by_resultant(surrogate: Surrogate) -> None:
