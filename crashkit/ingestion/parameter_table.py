@@ -36,6 +36,8 @@ SUFFIXES = (".csv", ".tsv", ".json", ".xlsx")
 # The header stands in one of the first rows: above it are titles.
 _TITLE_ROWS = 20
 _UNIT_ROWS = ("", "unit", "units", "einheit", "einheiten", "-")
+# What other code pages (Shift-JIS, GBK, those of DOS and old Macs) look like when they are taken for that of Windows.
+_OTHER_CODE_PAGE = re.compile(r"[^\x00-\x7f\w\s°·±×€–—…´«»„“”‘’§©®™ª²³]|\w[„“”‘«»®©§]\w|[^\W\d_\x00-\x7f]{3}|\ufffd")
 # A table of parameters is small; a workbook is packed and could be made to fill the memory.
 _MOST_BYTES = 64 << 20
 _PLAIN = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
@@ -298,6 +300,10 @@ def _decoded(content: bytes, path: Path) -> str:
             text = content.decode("utf-8-sig")
         except UnicodeDecodeError:
             text = content.decode("cp1252", errors="replace")
+            if _OTHER_CODE_PAGE.search(text):
+                raise ReadError(
+                    f"{path}: its letters are neither UTF-8 nor those of Windows in western Europe; save it as CSV in UTF-8"
+                ) from None
     if "\0" in text:
         raise ReadError(f"{path}: holds bytes that are no text; save the table as CSV in UTF-8, or as XLSX")
     return text
@@ -404,7 +410,8 @@ def _text(cell: Any) -> str:
     """A cell as text; spreadsheets keep the number 3 as 3.0 at times."""
     if cell is None or cell != cell:
         return ""
-    return str(int(cell)) if isinstance(cell, float) and cell.is_integer() else str(cell).strip()
+    text = str(int(cell)) if isinstance(cell, float) and cell.is_integer() else str(cell)
+    return "".join(c for c in text if unicodedata.category(c) != "Cf").strip()  # invisible characters
 
 
 def _number(cell: Any, mark: str, place: str, *, percent: bool = False) -> float:
@@ -426,7 +433,9 @@ def _number(cell: Any, mark: str, place: str, *, percent: bool = False) -> float
             text = text.replace(",", "")
         value = float(text) if _PLAIN.fullmatch(text) else float("nan")
     if value != value or abs(value) == float("inf"):
-        raise ReadError(f"{place}: found {_text(cell)[:40] or 'nothing'!r}, expected a number")
+        words = _text(cell)[:1].isalpha() and _text(cell).lower() not in ("nan", "inf", "none", "na")
+        cure = "; take a column that is no parameter out of the table" if words else ""
+        raise ReadError(f"{place}: found {_text(cell)[:40] or 'nothing'!r}, expected a number{cure}")
     return value
 
 

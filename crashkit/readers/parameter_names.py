@@ -61,7 +61,7 @@ def parameter_columns(titles: Sequence[str], units: Sequence[str], place: str) -
     Raises
     ------
     ReadError
-        Naming `place` and both columns where two would be one parameter, and a column that lacks a bracket.
+        Naming `place` and both columns where two would be one parameter, and a column that lacks a bracket or states two units.
     """
     from data_schema.units import is_unit
 
@@ -70,6 +70,9 @@ def parameter_columns(titles: Sequence[str], units: Sequence[str], place: str) -
     for title, beside in zip(titles, units, strict=True):
         _check_brackets(title, place)
         plain, unit = split_title(title, is_unit)
+        left = split_title(plain, is_unit)[1] if unit else ""
+        if left:
+            raise ReadError(f"{place}: column {title!r} states two units, {left} and {unit}; leave one")
         name = parameter_name(plain, place)
         other = first.setdefault(name.lower(), title)
         if len(out) and other is not title:

@@ -115,7 +115,8 @@ class LevelNetwork(nn.Module):
         if not self.at_rest:
             return self._decoded(z)
         if self.rest is not None and not torch.is_grad_enabled():
-            return self._decoded(z).sub_(self.rest)
+            moved = (z != 0).any(dim=1)  # a product of matrices rounds otherwise for another number of samples
+            return self._decoded(z).sub_(self.rest).mul_(moved[:, None])
         both = self._decoded(nn.functional.pad(z, (0, 0, 0, 1)))
         return both[:, :-1] - both[:, -1:]
 

@@ -287,3 +287,39 @@ def test_a_second_column_of_names_that_holds_numbers_is_said(
     assert [
         note.endswith("column 'sim' is taken for another name of the runs and is no parameter") for note in notes
     ] == ([True] if said else [])
+
+
+@pytest.mark.parametrize(
+    ("code_page", "title"),
+    [("cp437", "größe"), ("mac_roman", "größe"), ("shift_jis", "速度"), ("gbk", "厚度"), ("cp1251", "скорость")],
+)
+def test_letters_of_another_code_page_are_refused_instead_of_misread(tmp_path, code_page, title):
+    (tmp_path / "runs.csv").write_bytes(f"run,{title} [mm]\nx,1\n".encode(code_page))
+    with pytest.raises(ReadError, match="save it as CSV in UTF-8"):
+        read_parameter_table(tmp_path / "runs.csv")
+
+
+@pytest.mark.parametrize("title", ["größe", "l’épaisseur", "contraseña", "Øre", "winkel °", "„Maß“"])
+def test_letters_of_western_europe_are_read(tmp_path, title):
+    (tmp_path / "runs.csv").write_bytes(f"run,{title} [mm]\nx,1\n".encode("cp1252"))
+    assert list(read_parameter_table(tmp_path / "runs.csv").row("x").values()) == [(1.0, "mm")]
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("run,speed [m/s\nx,1\n", r"column 'speed \[m/s' lacks a bracket '\]'"),
+        ("run,speed [m/s] [km/h]\nx,1\n", "states two units, m/s and km/h"),
+        ("run,speed (m/s) in km/h\nx,1\n", "states two units"),
+        ("run,speed,note\nx,1,good\n", "found 'good', expected a number; take a column that is no parameter out"),
+    ],
+)
+def test_titles_and_columns_that_are_no_parameter_are_told_with_the_cure(tmp_path, text, told):
+    (tmp_path / "runs.csv").write_text(text)
+    with pytest.raises(ReadError, match=told):
+        read_parameter_table(tmp_path / "runs.csv")
+
+
+def test_invisible_letters_of_a_run_name_do_not_count(tmp_path):
+    (tmp_path / "runs.csv").write_text("run,speed\nx\u200b,1\n\ufeffy,2\n")
+    assert read_parameter_table(tmp_path / "runs.csv").row("y") == {"speed": (2.0, "")}

@@ -12,6 +12,7 @@ import pytest
 import xarray as xr
 from mesh_shapes import kart
 
+from crashkit.dataset import open_dataset
 from crashkit.errors import DataError, OutputError, ReadError
 from crashkit.mesh import (
     build_hierarchy,
@@ -270,3 +271,18 @@ def test_a_refined_hierarchy_is_stored_as_any_other(zarr_path: Path, hierarchy: 
     for level in again.levels:
         assert (level_displacement(zarr_path, level.index) == fine[:, :, level.kept]).all()
         assert np.abs(level.to_finer.sum(axis=1) - 1).max() <= 4 * np.finfo(float).eps
+
+
+def test_three_levels_of_one_netcdf_file_are_read_beside_the_open_dataset(tmp_path: Path) -> None:
+    """Groups that were opened and closed under an open dataset once ended the interpreter."""
+    path = tmp_path / "f.nc"
+    write(campaign(), path)
+    position, faces, _ = kart()
+    write_hierarchy(path, build_hierarchy(position, faces, [60, 30, 12]))
+    with open_dataset(path) as whole:
+        for _ in range(5):
+            assert len(open_hierarchy(path).levels) == 3
+            shown = [row["nodes"] for row in summarize_hierarchy(path)]
+            read = [level_displacement(path, level).shape[2] for level in (1, 2, 3)]
+            assert shown == read == [60, 30, 12]
+            assert np.isfinite(whole["displacement"].values).all()

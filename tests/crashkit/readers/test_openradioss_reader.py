@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import shutil
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -347,3 +349,19 @@ def test_two_files_of_one_number_are_refused(plain):
     shutil.copy(plain / "kartA001", plain / "kartA0001")
     with pytest.raises(ReadError, match="kartA0001 and kartA001 have the same number"):
         list(reader_for(plain).runs(plain))
+
+
+def test_a_gzip_file_is_unpacked_no_further_than_its_header_counts(run_b, plain, only_run):
+    """A hundred megabytes of zeros behind the last array, a hundred kilobytes on the disk."""
+    for file in plain.glob("kartA0*"):
+        packed = gzip.compress(file.read_bytes() + bytes(100 << 20 if file.name == "kartA001" else 0), 1)
+        file.with_name(f"{file.name}.gz").write_bytes(packed)
+        file.unlink()
+    tracemalloc.start()
+    try:
+        with contextlib.suppress(ReadError):  # that more follows may be refused, too
+            only_run(run_b).displacement(0, 2)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 30 << 20
