@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from data_schema.memory import give_back
 from surrogates.data.campaign import Campaign, CoarseRuns
 from surrogates.data.inputs import over_range
 from surrogates.data.samples import Notes, scale_of
@@ -242,6 +243,7 @@ def fit_pod_regression(
     with one_thread():
         best, core, choice, worth = _chosen(campaign, settings, chosen, trials, notes)
     core.modes = np.ascontiguousarray(courses.modes @ core.modes)
+    give_back()
     fit = PodFit(
         core, best.registration, choice, worth, lambda: _held(best, trials, settings, choice.modes), trials, best.plane
     )

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from data_schema.memory import give_back
 from surrogates.data.campaign import Campaign
 from surrogates.data.graphs import Graphs
 from surrogates.data.samples import FEWEST_TO_SPLIT, LevelRuns
@@ -184,6 +185,7 @@ class FoldTrainer(Trainer):
         self.seeded(number)
         if number in cascade.levels:
             cascade.drop_finest()
+        give_back()
         level = build_level(number, self.settings, graphs, cascade)
         cascade.add(number, level)
         return level
