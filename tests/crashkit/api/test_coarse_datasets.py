@@ -11,6 +11,8 @@ from typer.testing import CliRunner
 
 import crashkit
 from crashkit.api.model import Model
+from crashkit.api.predict_runs import predict_runs
+from crashkit.api.run_study import study_steps
 from crashkit.cli import app
 from crashkit.errors import DataError
 from crashkit.writers.d3plot import write_d3plot
@@ -165,3 +167,22 @@ def test_the_commands(coarse: xr.Dataset, tmp_path: Path) -> None:
     true = dataset(9, range(20, 21))["displacement"].values[0]
     found = np.load(tmp_path / "p.npz")["displacement"]
     assert np.linalg.norm(found - true, axis=-1).mean() < 0.1 * np.linalg.norm(true, axis=-1).mean()
+
+
+def test_rows_of_a_table_start_from_the_runs_of_their_names(model: Model, tmp_path: Path) -> None:
+    stored, table = tmp_path / "coarse.zarr", tmp_path / "table.csv"
+    dataset(5, range(70, 72), output=stored)
+    rows = [f"run_{k},{at(k)['speed']!r},{1e3 * at(k)['thickness']!r}" for k in (71, 70)]
+    table.write_text("run,speed (m/s),thickness (mm)\n" + "\n".join(rows) + "\n")
+    predict_runs(model, tmp_path / "p.npz", table=table, coarse_run=stored)
+    for k in (70, 71):
+        true = dataset(9, range(k, k + 1))["displacement"].values[0]
+        found = np.load(tmp_path / f"p_run_{k}.npz")["displacement"]
+        assert np.linalg.norm(found - true, axis=-1).mean() < 0.01 * np.linalg.norm(true, axis=-1).mean()
+
+
+def test_a_study_names_its_coarse_runs(tmp_path: Path) -> None:
+    study = tmp_path / "study.yaml"
+    study.write_text("dataset: fine.zarr\ntrain: {models: {pod-gpr: {coarse: coarse.zarr}}}\n")
+    trained = next(step for step in study_steps(study) if "train" in step.line)
+    assert f"--coarse {tmp_path / 'coarse.zarr'}" in trained.line
