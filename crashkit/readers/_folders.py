@@ -30,8 +30,13 @@ class Collected(Generic[Family]):
 
 
 def files_in(folder: Path) -> Iterator[Path]:
-    """The regular files of a folder by name, links to such files included."""
-    return (p for p in sorted(folder.iterdir()) if p.is_file())
+    """The regular files of a folder by name, links to such files included, hidden ones left out."""
+    return (p for p in sorted(folder.iterdir()) if p.is_file() and not hidden(p))
+
+
+def hidden(path: Path) -> bool:
+    """Whether a system or a program keeps it for itself: `.snapshot`, `._out.pvd` of macOS, `__MACOSX`."""
+    return path.name.startswith(".") or path.name == "__MACOSX"
 
 
 def named(families: Iterable[tuple[str, str, Family]]) -> dict[str, Family]:
@@ -69,6 +74,10 @@ def runs_in(
     """
     out: Collected[Family] = Collected()
     for folder in (path, *sorted(p for p in path.iterdir() if p.is_dir())):
+        if folder is not path and hidden(folder):
+            if recognises(find, folder):
+                out.aside.append(f"{folder} is a hidden folder and is left aside; name it to read it")
+            continue
         found = find(folder)
         out.aside += found.aside
         for own, family in found.runs.items():
@@ -91,7 +100,7 @@ def one_file_each(path: Path, is_run: Callable[[Path], bool]) -> Collected[Path]
         return Collected()
 
     def find(folder: Path) -> Collected[Path]:
-        return Collected(named((p.stem, p.name, p) for p in sorted(folder.iterdir()) if is_run(p)))
+        return Collected(named((p.stem, p.name, p) for p in sorted(folder.iterdir()) if not hidden(p) and is_run(p)))
 
     return runs_in(path, find, own_name_at_top=True)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -62,7 +63,7 @@ def xml_type(file: Path) -> str:
 
 
 def listed_states(file: Path) -> tuple[list[ListedState], tuple[str, ...]]:
-    """The states of a PVD collection or of a file series in its order, and what there is to say about the list.
+    """The states of a PVD collection or of a file series by their times, and what there is to say about the list.
 
     A solver that is started again appends to the list of its first start: a state listed twice is one state, and the
     last entry of each part counts.
@@ -90,6 +91,10 @@ def listed_states(file: Path) -> tuple[list[ListedState], tuple[str, ...]]:
             f"{file}: {len(again)} state{'s are' if len(again) > 1 else ' is'} listed more than once, from time "
             f"{min(again):g} on; the last entry of each counts",
         )
+    told = [time for time, _ in states if time is not None and math.isfinite(time)]
+    if len(told) == len(states) and told != sorted(told):
+        states.sort(key=lambda state: state[0] or 0.0)
+        notes = (*notes, f"{file}: its states are not listed in the order of their times, in which they are taken")
     return [ListedState(time, tuple(pieces.values())) for time, pieces in states], notes
 
 
@@ -111,12 +116,16 @@ def _pvd_entries(file: Path) -> list[tuple[float | None, object, Path]]:
     for entry in _tree(file, "a PVD collection").iter("DataSet"):
         attributes = entry.attrib
         try:
-            time = _seconds(attributes["timestep"]) if "timestep" in attributes else None
             path = file.parent / attributes["file"]
-        except (KeyError, ValueError) as error:
+        except KeyError as error:
             raise ReadError(
                 f"{file}: not readable as a PVD collection ({error}); it is cut short or damaged"
             ) from error
+        text = attributes.get("timestep", "").strip()
+        try:
+            time = _seconds(text) if text else None
+        except ValueError as error:
+            raise ReadError(f"{file}: the timestep {text!r} is no number; expected such as 0.005") from error
         part = tuple(attributes.get(name, "") for name in ("part", "group", "name"))
         entries.append((time, part if any(part) else None, path))
     return entries

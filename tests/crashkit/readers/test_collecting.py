@@ -347,3 +347,30 @@ def test_of_two_arrays_the_one_called_displacement_is_read_and_the_other_named(t
     (run,) = reader_for(tmp_path).runs(tmp_path)
     assert float(run.displacement(2, 3).max()) == 2
     assert "displacements are read from the array 'Displacement', not from 'U'" in run.notes[0]
+
+
+def test_states_listed_in_no_order_are_taken_by_their_times(tmp_path):
+    files = states(tmp_path, 0.1)
+    pvd(tmp_path / "out.pvd", [(0.1 * k, "", files[k].name) for k in (2, 0, 1)])
+    run = next(iter(reader_for(tmp_path).runs(tmp_path)))
+    assert run.time.tolist() == pytest.approx([0.0, 0.1, 0.2])
+    assert run.displacement(0, 3)[:, 0, 0].tolist() == pytest.approx([0.0, 0.1, 0.2])
+    assert "not listed in the order of their times" in " ".join(run.notes)
+
+
+@pytest.mark.parametrize(("time", "told"), [("0 s", "the timestep '0 s' is no number"), ("", "--time-step")])
+def test_times_that_are_none_are_not_called_damage(tmp_path, time, told):
+    files = states(tmp_path, 0.1)
+    pvd(tmp_path / "out.pvd", [(time, "", file.name) for file in files])
+    with pytest.raises(ReadError, match=told):
+        next(iter(reader_for(tmp_path).runs(tmp_path)))
+
+
+def test_hidden_folders_and_files_are_left_aside_and_said(tmp_path):
+    for folder in ("r1", ".snapshot", "__MACOSX"):
+        files = states(tmp_path / folder, 0.1)
+        pvd(tmp_path / folder / "out.pvd", [(0.1 * k, "", file.name) for k, file in enumerate(files)])
+    (tmp_path / "r1" / "._out.pvd").write_bytes(b"\x00\x05\x16\x07")
+    found = reader_for(tmp_path).runs(tmp_path)
+    assert found.names == ("r1",)
+    assert [text.split(" is ")[0].rsplit("/", 1)[1] for text in found.passed_over] == [".snapshot", "__MACOSX"]
