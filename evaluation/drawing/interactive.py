@@ -82,11 +82,13 @@ def interactive_view(
             f"truth {u.shape} and prediction {p.shape}: expected {len(times)} states of {len(x)} nodes x 3"
         )
     chosen = np.unique(np.round(np.linspace(0, len(times) - 1, min(max_states, len(times)))).astype(int))
-    u, p = np.asarray(u[chosen], np.float64), np.asarray(p[chosen], np.float64)
+    u, p = u[chosen], p[chosen]
     living = np.ones((len(chosen), len(corners)), bool) if alive is None else np.asarray(alive, bool)[chosen]
-    errors = [_errors(a, b, len(x) > max_nodes) for a, b in zip(u, p, strict=True)]
-
+    errors = [
+        _errors(a.astype(np.float64), b.astype(np.float64), len(x) > max_nodes) for a, b in zip(u, p, strict=True)
+    ]
     x, corners, u, p, living = _thinned(x, corners, u, p, living, levels, max_nodes)
+    u, p = u.astype(np.float64), p.astype(np.float64)
     there = np.asarray(np.isfinite(u).all(axis=-1))
     corners, living = _triangles(corners, living & (there[:, corners] | (corners < 0)).all(axis=-1))
     both = np.concatenate([x[None], x + last_seen(u), x[None], x + last_seen(p)])
@@ -141,25 +143,30 @@ def _limit(*fields: NDArray[np.float64]) -> float:
 def _thinned(
     x: NDArray[np.float64],
     corners: NDArray[Any],
-    u: NDArray[np.float64],
-    p: NDArray[np.float64],
+    u: NDArray[np.floating],
+    p: NDArray[np.floating],
     living: NDArray[np.bool_],
     levels: Sequence[Level],
     max_nodes: int,
-) -> tuple[NDArray[np.float64], NDArray[Any], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+) -> tuple[NDArray[np.float64], NDArray[Any], NDArray[np.floating], NDArray[np.floating], NDArray[np.bool_]]:
     if len(x) <= max_nodes:
         return x, corners, u, p, living
     fitting = [level for level in levels if max_nodes / _FEWEST <= level.n_nodes <= max_nodes]
     if fitting:
         kept, faces = fitting[0].kept, fitting[0].faces
     else:
-        from crashkit.mesh.hierarchy import build_hierarchy
+        from crashkit.mesh.hierarchy import PAIR_SHARE
+        from crashkit.mesh.selection import select_quadric
+        from crashkit.mesh.surface import surface
 
         # From the coarsest level that is still too fine, which takes far less time than from the full mesh.
         finer = [level for level in levels if level.n_nodes > max_nodes]
         kept, faces = (finer[-1].kept, finer[-1].faces) if finer else (np.arange(len(x)), corners)
-        level = build_hierarchy(x[kept], faces, [max_nodes])[1]
-        kept, faces = kept[level.kept], level.faces
+        mesh = surface(x[kept], faces)
+        # No lifting: the search for nodes that lift better, and the maps of a hierarchy, would take as long again.
+        count = min(max_nodes, int(mesh.used.sum()))
+        drawn = select_quadric(mesh, [count], PAIR_SHARE * mesh.diagonal, rounds=0)[0]
+        kept, faces = kept[drawn.kept], np.searchsorted(drawn.kept, drawn.faces)
     # A coarse face stands for many; it is shown as long as its nodes are there.
     return x[kept], faces, u[:, kept], p[:, kept], np.ones((len(u), len(faces)), bool)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from crashkit.mesh.hierarchy import build_hierarchy
-from evaluation.drawing.interactive import interactive_view
+from evaluation.drawing.interactive import _thinned, interactive_view
 from evaluation.errors import EvaluationError
 
 TIME = np.linspace(0, 0.03, 12)
@@ -127,3 +127,13 @@ def test_without_the_extra_the_message_says_what_to_install(monkeypatch):
     x, faces = tube()
     with pytest.raises(EvaluationError, match=r"pip install 'crashkit\[viewer\]'"):
         interactive_view(x, faces, TIME, *flight(len(x)))
+
+
+def test_a_mesh_is_thinned_to_the_nodes_of_its_faces_where_those_are_fewer() -> None:
+    square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    loose = np.arange(18.0).reshape(6, 3) + 5
+    x, corners = np.concatenate([loose, square]), np.array([[6, 7, 8], [6, 8, 9]])
+    moved = np.zeros((1, 10, 3))
+    at, faces, *_ = _thinned(x, corners, moved, moved, np.ones((1, 2), bool), (), 8)
+    np.testing.assert_array_equal(at, square)
+    assert sorted(map(sorted, faces.tolist())) == [[0, 1, 2], [0, 2, 3]]
