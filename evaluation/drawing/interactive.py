@@ -166,7 +166,7 @@ def _thinned(
         # No lifting: the search for nodes that lift better, and the maps of a hierarchy, would take as long again.
         count = min(max_nodes, int(mesh.used.sum()))
         drawn = select_quadric(mesh, [count], PAIR_SHARE * mesh.diagonal, rounds=0)[0]
-        kept, faces = kept[drawn.kept], np.searchsorted(drawn.kept, drawn.faces)
+        kept, faces = kept[drawn.kept], np.searchsorted(drawn.kept, drawn.faces).astype(np.int32)
     # A coarse face stands for many; it is shown as long as its nodes are there.
     return x[kept], faces, u[:, kept], p[:, kept], np.ones((len(u), len(faces)), bool)
 
