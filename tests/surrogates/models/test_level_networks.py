@@ -16,6 +16,7 @@ from surrogates.errors import SurrogateError
 from surrogates.models.cascade import Cascade, build_level
 from surrogates.operators.upsampling import Upsampling
 from surrogates.settings import settings
+from surrogates.training.train import train_surrogate
 
 PAPER_NODES = (1165, 292, 73)
 # Table 1 of the paper without its bookkeeping scalars; docs/method.md says how they differ.
@@ -178,3 +179,16 @@ def test_weights_of_another_shape_are_refused_by_name() -> None:
 def test_a_mesh_of_few_nodes_has_as_many_latent_numbers_as_displacements() -> None:
     cascade, _ = two_levels("level.latent=40")
     assert {number: cascade.latent(number) for number in cascade.numbers} == {2: 27, 1: 40}
+
+
+@pytest.mark.parametrize("model", ["aenn", "gaenn", "podnn"])
+def test_predictions_start_at_exactly_zero_however_many_states_are_asked_for(model: str) -> None:
+    """A product of matrices rounds otherwise for one column than for many."""
+    campaign = plate.campaign(9)
+    quick = ["level.epochs=2", "physics.clock=off", "physics.symmetry=off", "inputs.derived=off"]
+    surrogate = train_surrogate(campaign, settings(model, overrides=quick))
+    time = np.linspace(0, float(campaign.time[-1]), 301)
+    for count in (1, 2, 33, 301):
+        said = surrogate.predict_full(campaign.parameters[:1] * 1.01, time[:count])
+        assert (said[0, 0] == 0).all()
+    assert np.abs(said).max() > 0
