@@ -13,6 +13,7 @@ from scipy.interpolate import PchipInterpolator
 
 from surrogates.errors import SurrogateError
 from surrogates.models.pod_regression import PodRegression
+from surrogates.queries.misfit import _power
 from surrogates.queries.points import AtPoints, between_courses
 from surrogates.queries.posterior import posterior
 from surrogates.regression.gaussian import Gaussian
@@ -146,3 +147,11 @@ def test_more_parameters_are_sampled() -> None:
     found = posterior(Bells((0.3, 0.4, 0.5, 0.6), width=0.1), np.zeros(4), np.ones(4), samples=600, starts=2)
     assert np.allclose(found.samples.mean(axis=0), [0.3, 0.4, 0.5, 0.6], atol=0.02)
     assert np.allclose(found.samples.std(axis=0), 0.1, rtol=0.15)
+
+
+def test_the_region_is_wider_where_few_runs_tell_the_correlation() -> None:
+    drops = np.linspace(1, 20, 100)
+    few, many, all_known = (_power(drops, 5, runs) for runs in (24, 96, 10**6))
+    assert few < many < all_known
+    assert many / few == pytest.approx(1.4, abs=0.1)  # Hotelling's T squared: 1.49 against 1.08
+    assert _power(drops, 5, 4) > 0
