@@ -271,13 +271,18 @@ def worth(study: Study, kind: Kind) -> Columns:
 
 
 def regressions(study: Study) -> Columns:
-    """What each level of a cascade predicts its latent numbers with, as folds chose, of the first seed of each kind."""
+    """What each level of a cascade predicts its latent numbers with, as folds chose, with the first seed.
+
+    process: a Gaussian process over whole runs; 50 % process: its mean with networks.
+    """
     lines = []
-    for kind in dict.fromkeys(job.kind for job in study.compared() if job.kind.model == "mh" and job.seed == 0):
-        surrogate = crashkit.load_model(study.home / Job(kind).folder).surrogate
+    cascades = [job for job in study.jobs() if job.kind.model == "mh" and job.seed == 0 and study.trained(job)]
+    for job in cascades:
+        surrogate = crashkit.load_model(study.home / job.folder).surrogate
         for level in surrogate.level_names:
-            lines.append((kind.label(level), surrogate.record.choice.get(level, "a network")))
-    return columns(("model", "from_parameters_to_latent_numbers"), lines)
+            told = str(surrogate.record.choice.get(level, "network")).split(" (")[0]  # without the errors of the others
+            lines.append((job.kind.label(level), job.runs or study.plan.train, told))
+    return columns(("model", "training_runs", "from_parameters_to_latent_numbers"), lines)
 
 
 def not_trained(study: Study) -> Columns:
