@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from crashkit.api.model import Model
     from crashkit.ingestion.measured_points import MeasuredPoints
+    from data_schema.progress import Progress
     from surrogates.queries.misfit import Measured, Misfit
     from surrogates.queries.points import AtPoints
     from surrogates.queries.posterior import ParameterPosterior
@@ -26,6 +27,8 @@ _MOST_ROWS = 300
 _FAR = 0.05
 # An explanation with less of the posterior is none.
 _SHARE = 0.05
+# Predictions that a search takes for each free parameter, about; how many are timed; and seconds that are not worth a word.
+_PREDICTIONS, _TIMED, _SOON = 10_000, 16, 10.0
 # Measured displacements so many times smaller or larger than those of all training runs are of another size; factors
 # between units that are taken for one another.
 _OTHER, _MISTAKEN = 1.5, (10.0, 0.1, 1000.0, 1e-3, 100.0, 0.01, 25.4, 1 / 25.4)
@@ -159,6 +162,7 @@ def invert(
     known: Mapping[str, Any] | None = None,
     level: int | None = None,
     seed: int = 0,
+    report: Progress | None = None,
 ) -> Inversion:
     """Which parameters of the model explain measured positions, and how sure that is.
 
@@ -178,6 +182,8 @@ def invert(
         Mesh level that predicts; default: the finest one.
     seed
         Of the samples.
+    report
+        Called with what is done; the first call says about how long the search takes, where that is more than some seconds.
 
     Returns
     -------
@@ -218,6 +224,8 @@ def invert(
         notes.append(
             "the model has no band (too few runs); its error is taken from a regression of its own predictions"
         )
+    if report is not None:
+        report(f"searching the range{_duration(misfit)}", 0, 0, "")
     first = posterior(misfit, low, high, samples=500, seed=seed, starts=3)
     misfit = misfit.sized(first.best)
     found = posterior(misfit, low, high, seed=seed)
@@ -362,6 +370,19 @@ def _residual(
             "noise (m)": np.hypot(values.deviation, misfit.size * misfit.model_error),
         }
     )
+
+
+def _duration(misfit: Misfit) -> str:
+    """About how long the search takes, in words, by the time of some predictions; empty for some seconds."""
+    import time
+
+    some = misfit.runs[:_TIMED]
+    started = time.perf_counter()
+    misfit.predicted(some)
+    seconds = (time.perf_counter() - started) / len(some) * _PREDICTIONS * int(misfit.free.sum())
+    if seconds < _SOON:
+        return ""
+    return f", about {seconds / 60:.0f} min" if seconds > 90 else f", about {seconds:.0f} s"
 
 
 def _known_outside(surrogate: Surrogate, known: Mapping[str, Any] | None) -> list[str]:

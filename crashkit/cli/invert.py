@@ -41,8 +41,8 @@ def command(
     if not overwrite:
         refuse_earlier(output, "explanations.csv", "result")
     values = given(known or (), "--known")
-    with Progress(f"searching the range of {model}", quiet=json):
-        found = invert(model, measured, noise=noise, known=values, level=level, seed=seed)
+    with Progress(f"reading {model}", quiet=json) as shown:
+        found = invert(model, measured, noise=noise, known=values, level=level, seed=seed, report=shown.step)
         found.save(output)
     told = found.table()
     if json:

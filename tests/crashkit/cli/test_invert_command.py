@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -146,3 +147,15 @@ def test_a_best_value_outside_its_interval_is_told(model: Path, moved: np.ndarra
     said = _warnings(elsewhere, found._misfit, found.residual, found.names, found.units, np.ones(3))
     assert any(w.startswith("impact_speed, impact_angle") and "outside the 90 % interval" in w for w in said)
     assert not any("outside the 90 % interval" in w for w in found.warnings)
+
+
+def test_a_long_search_says_beforehand_how_long(
+    model: Path, moved: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    heard: list[str] = []
+    known = {"impact_angle": 4.0, "yield_stress": 3e8}
+    crashkit.invert(model, by_node(moved), known=known, report=lambda what, *_: heard.append(what))
+    assert heard == ["searching the range"]
+    monkeypatch.setattr("crashkit.api.invert._SOON", 0.0)
+    crashkit.invert(model, by_node(moved), known=known, report=lambda what, *_: heard.append(what))
+    assert re.fullmatch(r"searching the range, about \d+ (s|min)", heard[1])
