@@ -190,7 +190,7 @@ class Misfit:
             step = np.zeros_like(runs)
             step[:, k] = _STEP * (ranges.high - ranges.low)[k] * np.where(runs[:, k] > ranges.low[k], -1, 1)
             moved.append(self.predicted(runs + step) - at)
-        slopes, sizes = np.stack(moved, axis=-1), self.points.spread(runs)
+        slopes, sizes = np.stack(moved, axis=-1), self.points.spread_left_out(runs)
         whole, explained = np.empty(len(runs)), np.empty(len(runs))
         turned, bases = np.empty((len(runs), errors.shape[1])), np.empty((len(runs), *slopes.shape[1:]))
         for held in np.array_split(np.random.default_rng(0).permutation(len(runs)), min(_FOLDS, len(runs))):

@@ -11,12 +11,12 @@ from scipy import sparse
 
 from surrogates.models.pod_regression import PodRegression
 from surrogates.regression.gaussian import Gaussian
+from surrogates.uncertainty import Band, Beliefs
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from surrogates.surrogate import Surrogate
-    from surrogates.uncertainty import Band
 
 # Runs that are predicted at once.
 _CHUNK = 2048
@@ -81,6 +81,20 @@ class AtPoints:
         if band is None:
             return np.ones(len(parameters))
         return band.of_runs(self.surrogate.beliefs(parameters))
+
+    def spread_left_out(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+        """`spread` of the training runs, as the model tells it without each of them; (run, parameter) in their order.
+
+        At a run that it knows, a process believes in next to no error. Where the record does not tell, as `spread`.
+        """
+        band, record = self._band(), self.surrogate.record
+        names = record.fitted_runs
+        if band is None or len(parameters) != len(names) or any(name not in record.left_out for name in names):
+            return self.spread(parameters)
+        deviation = np.array([record.left_out[name][1] for name in names])
+        size = self.surrogate.registration.clock.size(parameters)
+        beliefs = Beliefs(size, deviation, *self.surrogate.places(parameters))
+        return np.asarray(beliefs.spread(band.spread, band.local, np.arange(len(names))) / band.unit)
 
     def left_out(self) -> NDArray[np.float64] | None:
         """(training run, state, point, 3), m: what a process over whole runs is off by where each run is left out of it.

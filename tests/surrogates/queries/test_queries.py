@@ -155,3 +155,15 @@ def test_the_region_is_wider_where_few_runs_tell_the_correlation() -> None:
     assert few < many < all_known
     assert many / few == pytest.approx(1.4, abs=0.1)  # Hotelling's T squared: 1.49 against 1.08
     assert _power(drops, 5, 4) > 0
+
+
+def test_a_left_out_run_is_as_uncertain_as_a_new_one(process: Surrogate) -> None:
+    """At runs it knows a process believes in next to no error; without them it does not."""
+    band = process.bands[0, False]
+    doubted = copy(process)
+    doubted.bands = {(0, False): replace(band, spread="deviation", unit=1.0)}
+    runs = np.array([process.record.parameters[n] for n in process.record.ranges.names]).T
+    points = AtPoints(doubted, sparse.identity(process.graphs.n_full, format="csr")[:3], process.record.time[-1:], None)
+    new = points.spread(runs + 0.05 * np.ptp(runs, axis=0))
+    assert np.median(points.spread(runs)) < 0.5 * np.median(points.spread_left_out(runs))
+    assert np.median(points.spread_left_out(runs)) > 0.5 * np.median(new)
