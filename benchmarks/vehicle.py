@@ -30,6 +30,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import os
 import shutil
 import subprocess
@@ -37,6 +38,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -126,7 +128,7 @@ def commands(place: Path, size: Size) -> list[Command]:
         return ("train", data, "-o", model[name], "--model", name, "--test", held, "--overwrite", *more)
 
     def predicted(name: str) -> tuple[str, ...]:
-        return ("predict", model[name], *asked, "-o", str(place / f"{name}.vtkhdf"))
+        return ("predict", model[name], *asked, "-o", str(place / f"{name}.vtkhdf"), "--overwrite")
 
     return [
         Command(
@@ -262,6 +264,12 @@ def measure(arguments: tuple[str, ...]) -> tuple[float, float, float]:
     return used.ru_utime + used.ru_stime, wall, used.ru_maxrss * unit / GIB
 
 
+def apart(call: Callable[..., Any], *arguments: Any) -> Any:
+    """What a function gives, in a process of its own: a command's peak memory begins at that of the process that starts it."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(call, *arguments).result()
+
+
 def rates_of(dataset: Path) -> Rates:
     """The rates of one core, each the best of three: the dataset's first runs read, one of them written, a product."""
     found = json.loads(
@@ -310,7 +318,7 @@ def of_size(place: Path, nodes: int, options: argparse.Namespace) -> Iterator[Me
     place.mkdir(parents=True, exist_ok=True)
     about = place / "size.json"
     if not about.exists():
-        made = make(place / "runs.h5", options.campaign or demo_data(), nodes, options.runs, options.states)
+        made = apart(make, place / "runs.h5", options.campaign or demo_data(), nodes, options.runs, options.states)
         about.write_text(json.dumps({"nodes": made, "runs": options.runs, "states": options.states}))
     size = Size(**json.loads(about.read_text()), test=max(1, options.runs // 4), epochs=tuple(options.epochs))
     rates = None
@@ -321,7 +329,7 @@ def of_size(place: Path, nodes: int, options: argparse.Namespace) -> Iterator[Me
         rates = rates or rates_of(place / "runs.zarr")
         files = place / "report_files" / "vtk"
         written = float(sum(f.stat().st_size for f in files.rglob("*") if f.is_file())) if files.exists() else 0.0
-        known = Size(**{**asdict(size), "levels": levels_of(place / "runs.zarr"), "written": written})
+        known = Size(**{**asdict(size), "levels": apart(levels_of, place / "runs.zarr"), "written": written})
         share = size.nodes * size.runs * size.states / FULL
         goal = None if command.seconds is None else max(command.start, command.seconds * share)
         yield Measured(
