@@ -155,7 +155,10 @@ def commands(place: Path, size: Size) -> list[Command]:
             "evaluate, files", ("evaluate", *both, "-o", str(place / "report_files"), "--write-vtkhdf"), None, None,
             lambda s, r: (3 * s.test + s.training) * s.run / r.read + s.written / r.write, start=30.0,
         ),
-        Command("info --report", ("info", data, "--report", str(place / "card.html"), "--overwrite"), None, None, lambda s, r: s.runs * s.run / r.read),
+        Command(
+            "info --report", ("info", data, "--report", str(place / "card.html"), "--overwrite"), None, None,
+            lambda s, r: s.runs * s.run / r.read,
+        ),
     ]  # fmt: skip
 
 
