@@ -9,7 +9,7 @@ epochs are good for runs left out, then again on all runs for so many. The regre
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -29,6 +29,7 @@ from surrogates.record import Fit
 from surrogates.reductions.reduction import LinearReduction
 from surrogates.settings import LevelSettings, Settings
 from surrogates.surrogate import level_name
+from surrogates.training.loop import Objective
 from surrogates.training.objectives import LevelObjective, chunk
 from surrogates.training.regression import Chosen, Latents, choose_regression, left_out_by_process
 from surrogates.training.trainer import Trainer
@@ -38,6 +39,8 @@ _MATTERS = 0.02
 # Share of what a start at POD loses (mean square) that training takes away at most: on the kart's levels it was a quarter,
 # after half an hour.
 _GAINED = 0.5
+# Trainings of so many epochs begin with a trial of this share of them.
+_LONG, _TRIAL = 100, 0.25
 # Sizes of latent numbers: at so many latent vectors, by this share of their spread.
 _PLACES, _STEP = 8, 0.25
 
@@ -81,16 +84,23 @@ class FoldTrainer(Trainer):
         chosen = choose_regression(
             level, latents, "process" if interrupted else settings.regression,
             lambda objective: self.fit(objective, settings, name, self.seeded(number)), self.settings.seed,
-            self.registration.inputs.mixed,
+            self.registration.inputs.mixed, self._trial(settings, name, number),
         )  # fmt: skip
         for note in chosen.notes:
-            self.notes.add(note)
+            self.notes.add(f"{name}: {note}" if not note.startswith(name) else note)
         if interrupted:
             chosen.fit.status = "interrupted"
         chosen.reduction_epochs = epochs
         chosen.fit.seconds = time.perf_counter() - started
         self.chosen[number], self.latents[number] = chosen, latents
         return chosen.fit
+
+    def _trial(self, settings: LevelSettings, name: str, number: int) -> Callable[[Objective], Fit] | None:
+        """A short training of networks, with its own schedule; None where the whole one is short or is never to end early."""
+        if not settings.patience or settings.epochs < _LONG:
+            return None
+        short = settings.model_copy(update={"epochs": round(_TRIAL * settings.epochs)})
+        return lambda objective: self.fit(objective, short, f"{name} trial", self.seeded(number))
 
     @property
     def own(self) -> int:

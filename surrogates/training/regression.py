@@ -28,6 +28,10 @@ SHARES: Mapping[Wish, tuple[float, ...]] = {
 }  # fmt: skip
 
 
+# Networks that are so many times as wrong as the process after their trial bring a mixture of both a percent at most.
+_HOPELESS = 1.25
+
+
 def named(share: float) -> str:
     """What a share of the process is called."""
     return {0.0: "network", 1.0: "process"}.get(share, f"{100 * share:g} % process")
@@ -193,10 +197,12 @@ def choose_regression(
     train: Callable[[Objective], Fit],
     seed: int,
     mixed: Sequence[int] = (),
+    trial: Callable[[Objective], Fit] | None = None,
 ) -> Chosen:
     """Train and choose the regression of `level`, and put it in place.
 
     train  runs the training loop on an objective
+    trial  the same for a share of the epochs; networks that are far from the process after it are trained no further
     mixed  parameters whose lengths form a full matrix, see `regression.gaussian.Gaussian`
     """
     regressor = level.regressor
@@ -208,10 +214,23 @@ def choose_regression(
     notes: list[str] = []
     networks: Tensor | None = None
     fitted = Fit()
+    processes, process = _processes(latents, shares, seed, mixed)
     if shares != (1.0,):
         objective = FoldedNetworks(regressor, courses, latents, level.scale)
         try:
-            fitted = train(objective)
+            if trial is not None and processes is not None and len(shares) > 1:
+                fitted = trial(objective)
+                behind = _behind(objective, processes, latents)
+                if fitted.status == "finished" and behind > _HOPELESS:
+                    notes.append(
+                        f"after a trial of {fitted.epochs} epochs the network is {behind:.1f} times as wrong as the process on "
+                        "runs left out, and is trained no further"
+                    )
+                elif fitted.status == "finished":
+                    objective = FoldedNetworks(regressor, courses, latents, level.scale)
+                    fitted = train(objective)
+            else:
+                fitted = train(objective)
         except Diverged as error:
             if wish != "auto" or not latents.differ:
                 error.fit = None  # the level has no regression yet
@@ -219,10 +238,8 @@ def choose_regression(
             fitted, shares = error.fit or Fit(status="diverged"), (1.0,)
             notes.append(f"{error}; the process alone is used")
         else:
-            everyone = torch.arange(len(latents.part), device=latents.part.device)
-            networks = torch.stack([objective.said(fold, everyone) for fold in range(latents.folds + 1)])
+            networks = _networks(objective, latents)
             regressor.take(objective.regressor, latents.folds * regressor.members)
-    processes, process = _processes(latents, shares, seed, mixed)
     said, errors = {}, {}
     for share in shares:
         said[share] = _mixed(networks, processes, share)
@@ -233,6 +250,21 @@ def choose_regression(
     if level.process is not None:
         level.process.share.fill_(best)
     return Chosen(said[best], best, fitted, {named(share): error for share, error in errors.items()}, notes)
+
+
+def _networks(objective: FoldedNetworks, latents: Latents) -> Tensor:
+    """(fold + 1, run, state, latent): what the networks without each fold, and of all runs, say."""
+    everyone = torch.arange(len(latents.part), device=latents.part.device)
+    return torch.stack([objective.said(fold, everyone) for fold in range(latents.folds + 1)])
+
+
+def _behind(objective: FoldedNetworks, processes: Tensor, latents: Latents) -> float:
+    """The networks' error on runs left out over that of the processes."""
+    network, process = (
+        _error(Chosen(said, 0.0, Fit()).left_out(latents), latents)
+        for said in (_networks(objective, latents), processes)
+    )
+    return network / process if process else 1.0
 
 
 def left_out_by_process(latents: Latents, seed: int, mixed: Sequence[int] = ()) -> Tensor | None:

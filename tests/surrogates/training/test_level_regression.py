@@ -285,3 +285,17 @@ def test_runs_that_agree_in_all_parameters_leave_the_network_alone(wish: Any) ->
     assert left_out_by_process(latents(inputs=inputs), seed=0) is None
     with pytest.raises(Diverged):
         choose_regression(of, latents(inputs=inputs), wish, diverging, seed=0)
+
+
+@pytest.mark.parametrize(("tried", "trained"), [(lambda _: Fit(), 0), (None, 1)])
+def test_a_network_far_from_the_process_after_its_trial_is_trained_no_further(tried, trained: int) -> None:
+    whole: list[object] = []
+
+    def train(objective: object) -> Fit:
+        whole.append(objective)
+        return exact(objective)
+
+    chosen = choose_regression(level(), latents(), "auto", train, seed=0, trial=tried or exact)
+    assert len(whole) == trained
+    assert chosen.told == ("network" if trained else "process")
+    assert bool(chosen.notes) == (not trained)
