@@ -195,13 +195,13 @@ def coarsen_with_files(
 
 
 def _nodes_of_levels(path: Path) -> tuple[int, ...]:
-    """Nodes of the levels that a dataset has already; none where it has none, or where they are damaged."""
+    """Nodes of the levels that a dataset has already; none where it has none, or where it cannot be read."""
     from crashkit.errors import CrashkitError
     from crashkit.mesh.store import has_hierarchy, summarize_hierarchy
 
     try:
         return tuple(row["nodes"] for row in summarize_hierarchy(path)) if has_hierarchy(path) else ()
-    except CrashkitError:
+    except (CrashkitError, OSError):  # said by what reads it next
         return ()
 
 

@@ -253,7 +253,7 @@ def test_elements_that_are_likely_gone_are_hidden(
     hidden = {}
     for share in ("0.1", "0.5", "1"):
         arguments = ["predict", str(tmp_path / "gpr"), *values, "-o", str(tmp_path / "new.pvd"), "--extrapolate"]
-        told = CliRunner().invoke(app, [*arguments, "--hide-above", share])
+        told = CliRunner().invoke(app, [*arguments, "--hide-above", share, "--overwrite"])
         assert told.exit_code == 0, told.output
         assert "elements gone at the end" in told.output
         _, grid = read_state(tmp_path / "new.pvd")
