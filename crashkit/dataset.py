@@ -88,6 +88,16 @@ def open_dataset(
 
 
 @contextlib.contextmanager
+def opened_dataset(path: str | Path, *, indexes: bool = True) -> Iterator[xr.Dataset]:
+    """The dataset at `path` within this context, without Dask; values that are damaged raise ReadError as they are read.
+
+    For reading: an error of any other kind within it is taken for damage, see `reading_dataset`.
+    """
+    with open_dataset(path, chunks=None, indexes=indexes) as dataset, reading_dataset(path):
+        yield dataset
+
+
+@contextlib.contextmanager
 def reading_dataset(path: str | Path) -> Iterator[None]:
     """Values read lazily from a damaged dataset raise ReadError within this context, and not what libraries raise."""
     try:
@@ -128,7 +138,7 @@ def dataset_checksum(dataset: str | Path | xr.Dataset) -> str:
     Ingest keeps the same number in the attribute `checksum`.
     """
     if not isinstance(dataset, xr.Dataset):
-        with open_dataset(dataset, chunks=None) as opened, reading_dataset(dataset):
+        with opened_dataset(dataset) as opened:
             return dataset_checksum(opened)
     runs = range(dataset.sizes["sim"])
     return _checksum_from(dataset, [run_checksum(digests_of_run(dataset, k)) for k in runs])

@@ -330,13 +330,13 @@ def _held(states: NDArray[np.float32], name: str) -> NDArray[np.float32]:
 
 def own_parameters(given: str | Path, names: Sequence[str]) -> dict[str, float]:
     """What a run of a dataset says of its own parameters, by name, in SI; empty for files of a solver."""
-    from crashkit.dataset import open_dataset
+    from crashkit.dataset import opened_dataset
     from crashkit.selection import runs_of
 
     path, run = _path_and_run(str(given))
     if path.suffix not in _SUFFIXES or not path.exists():
         return {}
-    with open_dataset(path, chunks=None) as dataset:
+    with opened_dataset(path) as dataset:
         runs = [str(n) for n in dataset["sim"].values]
         if run is None and len(runs) > 1:
             return {}

@@ -65,7 +65,7 @@ def coarsen(
     """
     import xarray as xr
 
-    from crashkit.dataset import open_dataset
+    from crashkit.dataset import opened_dataset
     from crashkit.errors import MeshError
     from crashkit.mesh.hierarchy import build_hierarchy, ratios_to_counts
     from crashkit.mesh.store import mesh_of, open_mesh, parts_without_faces, write_hierarchy
@@ -76,7 +76,7 @@ def coarsen(
     in_hand = isinstance(dataset, xr.Dataset)
     held: list[int] = []
     if test is not None and not isinstance(dataset, xr.Dataset):
-        with open_dataset(dataset, chunks=None) as opened:
+        with opened_dataset(dataset) as opened:
             held = runs_of([str(name) for name in opened["sim"].values], test)
     mesh = mesh_of(dataset) if isinstance(dataset, xr.Dataset) else open_mesh(Path(dataset))
     try:

@@ -42,7 +42,7 @@ def export_run(
     OutputError
         If `output` cannot be written, or is there.
     """
-    from crashkit.dataset import open_dataset, reading_dataset
+    from crashkit.dataset import opened_dataset
     from crashkit.errors import OutputError
     from crashkit.output import refuse_there
     from crashkit.selection import runs_of
@@ -53,7 +53,7 @@ def export_run(
         raise OutputError(f"{output}: a run is written as .pvd or .vtkhdf (.vtu or .vtp for a single state)")
     refuse_there([Path(output)], overwrite)
     if isinstance(dataset, (str, Path)):
-        with open_dataset(dataset, chunks=None) as opened, reading_dataset(dataset):
+        with opened_dataset(dataset) as opened:
             return export_run(opened, run, output, overwrite=overwrite)
     names = [str(name) for name in dataset["sim"].values]
     place = runs_of(names, [run])[0]

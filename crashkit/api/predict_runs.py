@@ -351,11 +351,11 @@ def _of_table(record: Record, output: Path, table: Path) -> list[_Wanted]:
 
 
 def _known(record: Record, output: Path, run: str | int, dataset: Path) -> _Wanted:
-    from crashkit.dataset import open_dataset, reading_dataset
+    from crashkit.dataset import opened_dataset
     from crashkit.errors import DataError
     from crashkit.selection import runs_of
 
-    with open_dataset(dataset, chunks=None) as opened, reading_dataset(dataset):
+    with opened_dataset(dataset) as opened:
         place = runs_of([str(n) for n in opened["sim"].values], [run])[0]
         missing = [n for n in record.ranges.names if n not in opened]
         if missing:

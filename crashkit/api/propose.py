@@ -85,10 +85,10 @@ def _parameters(dataset: str | Path) -> tuple[list[str], list[str], NDArray[np.f
     import numpy as np
 
     from crashkit.campaign.box import CampaignError
-    from crashkit.dataset import open_dataset
+    from crashkit.dataset import opened_dataset
     from data_schema import parameters
 
-    with open_dataset(dataset, chunks=None) as opened:
+    with opened_dataset(dataset) as opened:
         names = parameters(opened)
         if not names:
             raise CampaignError(f"{dataset}: no run has a parameter; give them with crashkit ingest --params")

@@ -360,12 +360,12 @@ def _compute(campaign: Campaign, report: Progress | None) -> None:
 
 def _ingest(campaign: Campaign) -> int:
     """Append the runs that are done and not in the dataset yet; returns how many."""
-    from crashkit.dataset import open_dataset
+    from crashkit.dataset import opened_dataset
     from crashkit.ingestion.ingest import ingest
 
     known: set[str] = set()
     if campaign.dataset.exists():
-        with open_dataset(campaign.dataset, chunks=None) as dataset:
+        with opened_dataset(campaign.dataset) as dataset:
             known = {str(n) for n in dataset["sim"].values}
     new = [
         place

@@ -188,9 +188,9 @@ def _files(path: Path) -> Iterator[Path]:
 
 def _only_more(data: Path, sources: Iterable[Path]) -> bool:
     """Whether every file the dataset was read from is still there, as far as names and sizes tell: then runs are added."""
-    from crashkit.dataset import open_dataset
+    from crashkit.dataset import opened_dataset
 
-    with open_dataset(data, chunks=None) as dataset:
+    with opened_dataset(data) as dataset:
         entries = json.loads(dataset.attrs["source_files"])
     files = {(str(e["file"]), int(e["bytes"]), str(e["sha256"])) for e in entries}  # one may hold several runs
     read = Counter((name, size) for name, size, _ in files)
@@ -207,11 +207,11 @@ def _digest(texts: Iterable[str]) -> str:
 
 def _checksum(data: Path) -> str:
     """The checksum that the dataset keeps; empty where it is not there yet."""
-    from crashkit.dataset import open_dataset
+    from crashkit.dataset import opened_dataset
 
     if not data.exists():
         return ""
-    with open_dataset(data, chunks=None) as dataset:
+    with opened_dataset(data) as dataset:
         return str(dataset.attrs.get("checksum", ""))
 
 

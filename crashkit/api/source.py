@@ -102,13 +102,13 @@ def _on_disk(dataset: xr.Dataset) -> Hierarchy | None:
     """The hierarchy of the file that the dataset in hand was opened from, where it still has the mesh of that file."""
     import numpy as np
 
-    from crashkit.dataset import open_dataset
+    from crashkit.dataset import opened_dataset
     from crashkit.mesh.store import has_hierarchy, open_hierarchy
 
     origin = dataset.encoding.get("source")
     if not origin or not Path(origin).exists() or not has_hierarchy(origin):
         return None
-    with open_dataset(origin, chunks=None) as stored:
+    with opened_dataset(origin) as stored:
         names = [
             "node_id",
             "face_nodes",

@@ -37,13 +37,13 @@ def validate(dataset: str | Path | xr.Dataset, *, values: bool = True) -> list[V
     import numpy as np
     import xarray as xr
 
-    from crashkit.dataset import open_dataset, reading_dataset
+    from crashkit.dataset import opened_dataset, reading_dataset
     from data_schema import validate as violations
 
     if isinstance(dataset, xr.Dataset):
         with reading_dataset(str(dataset.encoding.get("source", "the dataset in memory"))):
             return violations(_alone(dataset), values=values)
-    with open_dataset(dataset, chunks=None) as opened, reading_dataset(dataset):
+    with opened_dataset(dataset) as opened:
         found = violations(opened, values=values)
         if values:
             for variable in opened.variables.values():  # results were read by state; what is small, no rule may ask for
@@ -68,12 +68,12 @@ def _read_levels(path: Path) -> None:
 
 def _alone(dataset: xr.Dataset) -> xr.Dataset:
     """The dataset without the checksum of the whole, where it is a selection of what lies on disk."""
-    from crashkit.dataset import open_dataset
+    from crashkit.dataset import opened_dataset
 
     origin = dataset.encoding.get("source")
     if "checksum" not in dataset.attrs or not origin or not Path(origin).exists():
         return dataset
-    with open_dataset(origin, chunks=None) as whole:
+    with opened_dataset(origin) as whole:
         if dict(whole.sizes) == dict(dataset.sizes):
             return dataset
     alone = dataset.copy(deep=False)

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crashkit.chunks import KEYS, codecs
-from crashkit.dataset import open_dataset, reading_dataset
+from crashkit.dataset import open_dataset, opened_dataset, reading_dataset
 from crashkit.errors import DataError, OutputError, ReadError
 from crashkit.mesh.levels import Hierarchy
 from crashkit.mesh.lifting import LiftingError, LiftingMeter
@@ -184,7 +184,7 @@ def summarize_hierarchy(path: str | Path) -> list[dict[str, Any]]:
     hierarchy was made by a crashkit that did not tell parts apart.
     """
     path = Path(path)
-    with open_dataset(path, chunks=None, indexes=False) as dataset:
+    with opened_dataset(path, indexes=False) as dataset:
         titles = [str(name) for name in dataset["part_name"].values] if "part_name" in dataset else []
         numbers = dataset["part_id"].values.tolist() if "part_id" in dataset else []
     parts = [t if titles.count(t) == 1 else f"{t} ({n})" for t, n in zip(titles, numbers, strict=True)]
@@ -245,7 +245,7 @@ def open_mesh(path: Path) -> MeshArrays:
     ReadError
         If the file is no crash dataset or lacks its faces.
     """
-    with open_dataset(path, chunks=None, indexes=False) as dataset:
+    with opened_dataset(path, indexes=False) as dataset:
         return mesh_of(dataset)
 
 
@@ -268,7 +268,7 @@ def parts_without_faces(path: Path) -> list[str]:
     ReadError
         If the file is no crash dataset or lacks its faces.
     """
-    with open_dataset(path, chunks=None, indexes=False) as dataset:
+    with opened_dataset(path, indexes=False) as dataset:
         if "cell_part" not in dataset:
             return []
         cells, owner = dataset["cell_nodes"].values, dataset["cell_part"].values
@@ -315,7 +315,7 @@ def _open_level(path: Path, index: int) -> Iterator[xr.Dataset]:
 
 def _about(path: Path) -> dict[str, Any]:
     """Attributes of /hierarchy, checked against the dataset around it; `nodes` is added."""
-    with open_dataset(path, chunks=None, indexes=False) as dataset:
+    with opened_dataset(path, indexes=False) as dataset:
         try:
             with _open_group(path, "hierarchy") as group:
                 about = dict(group.attrs)

@@ -6,6 +6,7 @@ import contextlib
 import random
 import shutil
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,11 +14,12 @@ import pytest
 from crashkit.api.campaign import open_campaign
 from crashkit.api.coarsen import coarsen
 from crashkit.api.describe import describe_dataset
+from crashkit.api.propose import propose
 from crashkit.api.source import source_of
 from crashkit.api.validate import validate
 from crashkit.dataset import open_dataset, reading_dataset
 from crashkit.errors import ReadError
-from crashkit.mesh.store import level_displacement
+from crashkit.mesh.store import level_displacement, open_mesh, summarize_hierarchy
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +77,28 @@ def test_run_and_chunk_are_named(coarsened: Path) -> None:
     finally:
         chunk.write_bytes(before)
     read_all(coarsened)
+
+
+@pytest.mark.parametrize(
+    ("variable", "reads"),
+    [
+        *[(name, open_mesh) for name in ("reference_position", "face_nodes", "face_part", "node_id", "part_id")],
+        *[(name, source_of) for name in ("reference_position", "face_nodes")],
+        ("part_name", summarize_hierarchy),
+        ("impact_speed", lambda path: propose(path, 2)),
+    ],
+)
+def test_what_a_command_reads_first_may_be_what_is_damaged(
+    coarsened: Path, variable: str, reads: Callable[[Path], object]
+) -> None:
+    chunk = next(p for p in chunk_files(coarsened) if p.parent == coarsened / variable)
+    before = chunk.read_bytes()
+    try:
+        chunk.write_bytes(before[:-1] + bytes([before[-1] ^ 1]))
+        with pytest.raises(ReadError, match=rf"kart\.zarr: chunk {variable}/c\.0.* is damaged"):
+            reads(coarsened)
+    finally:
+        chunk.write_bytes(before)
 
 
 def test_runs_that_a_user_stores_with_xarray_are_a_dataset(coarsened: Path, tmp_path: Path) -> None:
