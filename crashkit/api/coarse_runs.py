@@ -55,6 +55,8 @@ def coarse_runs(given: str | Path | xr.Dataset, campaign: Campaign, source: Sour
 
     below = source_of(given)
     found = open_campaign(below)
+    if found.checksum and found.checksum == campaign.checksum:
+        raise DataError(f"{below.name}: is {source.name} itself; expected further runs, on a coarser mesh")
     order = _order(found, campaign, below.name)
     matched = _parts(found, campaign, below.name)
     points, faces, labels = _mesh(found)

@@ -503,6 +503,7 @@ def as_model(surrogate: Surrogate, folder: Path, reference: Reference) -> Compar
         seed=record.seed,
         averaged=len(surrogate.seeds),
         configuration=configuration,
+        beneath=str(record.coarse.get("checksum", "")),
         known={name: told for name, told in record.physics.items() if isinstance(told, str)},
         worth=record.physics.get("errors") or {},
         hard=surrogate.hard_runs(),

@@ -81,7 +81,7 @@ def _value(name: str, given: float | str, unit: str, written: tuple[str, float])
 
     from crashkit.errors import DataError
     from data_schema import to_si
-    from data_schema.units import number_and_unit
+    from data_schema.units import UnknownUnits, number_and_unit
 
     if not isinstance(given, str):
         value = float(given)
@@ -94,7 +94,10 @@ def _value(name: str, given: float | str, unit: str, written: tuple[str, float])
             )
         value, own = found
         if own:
-            factor, si = to_si(own)
+            try:
+                factor, si = to_si(own)
+            except UnknownUnits as error:
+                raise DataError(f"{name}={given}: {error}") from error
             if si != to_si(unit)[1]:
                 raise DataError(
                     f"{name}={given}: the unit {own!r} is not one of {name}, which is in {written[0] or 'no unit'}"

@@ -338,7 +338,7 @@ def _of_table(record: Record, output: Path, table: Path) -> list[_Wanted]:
             _Wanted(row.run, row.parameters, output / row.output.stem)
             for row in _of_table(record, output.with_name("of_a_table"), table)
         ]
-    return [
+    wanted = [
         _Wanted(
             row,
             {n: f"{v!r}{unit}" for n, (v, unit) in values.items() if n in record.ranges.names},
@@ -348,6 +348,14 @@ def _of_table(record: Record, output: Path, table: Path) -> list[_Wanted]:
         )
         for row, values in read_parameter_table(table).rows.items()
     ]
+    rows: dict[str, str] = {}  # by the file's name, in which some systems do not tell capitals apart
+    for one in wanted:
+        other = rows.setdefault(one.output.name.lower(), one.run)
+        if other != one.run:
+            raise OutputError(
+                f"{table}: rows {other!r} and {one.run!r} would both be written to {one.output.name}; rename one of them"
+            )
+    return wanted
 
 
 def _known(record: Record, output: Path, run: str | int, dataset: Path) -> _Wanted:

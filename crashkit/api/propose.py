@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
     from crashkit.campaign.box import Box
     from crashkit.campaign.plan import Method
+    from data_schema.progress import Progress
 
 
 def propose(
@@ -22,6 +23,7 @@ def propose(
     method: Method = "expected-reduction",
     seed: int = 0,
     odd: tuple[str, ...] = (),
+    report: Progress | None = None,
 ) -> pd.DataFrame:
     """Parameters of the next `count` runs, one row per run.
 
@@ -40,6 +42,8 @@ def propose(
         The same seed gives the same table.
     odd
         Parameters that change their sign when the structure is mirrored, besides those the box names.
+    report
+        Told what is being done.
 
     Returns
     -------
@@ -73,7 +77,7 @@ def propose(
         )  # fmt: skip
         about: dict[str, float] = {}
     else:
-        points, about = _most_useful(dataset, box, count, seed, odd)
+        points, about = _most_useful(dataset, box, count, seed, odd, report)
     table = pd.DataFrame([[float(f"{v:.7g}") for v in row] for row in points], columns=list(box.names))
     table.attrs["units"] = dict(zip(box.names, box.units, strict=True))
     table.attrs.update(about)
@@ -97,7 +101,7 @@ def _parameters(dataset: str | Path) -> tuple[list[str], list[str], NDArray[np.f
 
 
 def _most_useful(
-    dataset: str | Path, box: Box, count: int, seed: int, odd: tuple[str, ...]
+    dataset: str | Path, box: Box, count: int, seed: int, odd: tuple[str, ...], report: Progress | None
 ) -> tuple[NDArray[np.float64], dict[str, float]]:
     """The points that lower the error over the box most, by a process trained on all runs; and what is expected of them."""
     import tempfile
@@ -108,7 +112,11 @@ def _most_useful(
     mirrored = sorted({*odd, *(n for n, r in box.parameters.items() if r.odd)})
     settings = [f"physics.odd=[{', '.join(mirrored)}]"] if mirrored else []
     with tempfile.TemporaryDirectory(prefix="crashkit-propose-") as folder:
-        surrogate = train(dataset, Path(folder) / "model", "pod-gpr", settings=settings, seed=seed).surrogate
+        surrogate = train(
+            dataset, Path(folder) / "model", "pod-gpr", settings=settings, seed=seed, report=report
+        ).surrogate
+    if report is not None:
+        report("choosing the next runs", 0, 0, "")
     known = TrainedProcess.of(surrogate, box)
     points, share = known.best(known.of_runs(_parameters(dataset)), count, seed)
     error = known.judge(0.9, seed).error

@@ -162,6 +162,24 @@ class _Study:
 
         return PredictedRuns(self.surrogate, self.structure, parameters, self.time, self.level, states)
 
+    def states(self, parameters: Floats) -> NDArray[np.float32]:
+        """(run, state, node, 3), m; raises DataError for parameters at which the model has no numbers, such as a speed below 0."""
+        from crashkit.errors import DataError
+
+        with np.errstate(invalid="ignore", over="ignore"):  # refused in the next line
+            states = self.surrogate.predict_full(parameters, self.time, self.level)
+        bad = ~np.isfinite(states).all(axis=(1, 2, 3))
+        if bad.any():
+            ranges = self.surrogate.record.ranges
+            values = parameters[int(bad.argmax())]
+            some = ", ".join(f"{one.name} {values[k]:.4g} {one.unit}" for one, k in zip(self.scatters, self.columns))
+            raise DataError(
+                f"a draw with {some} gives numbers that are not finite: the model takes "
+                + ", ".join(f"{ranges.names[k]} from {ranges.low[k]:.4g} to {ranges.high[k]:.4g}" for k in self.columns)
+                + "; let them scatter less, or within limits, such as --vary NAME=WIDTH:uniform"
+            )
+        return states
+
     def full(self, draws: Floats) -> Floats:
         """(draw, parameter that scatters) -> (draw, parameter of the model)."""
         out = np.repeat(self.nominal[None], len(draws), axis=0)
@@ -210,7 +228,7 @@ class _Study:
             if set(bound.formula.value(first, self.formulas).axes) == {"time", "node"}
         }
         for rows, parameters in self.blocks(draws, "draws"):
-            states = surrogate.predict_full(parameters, self.time, self.level)
+            states = self.states(parameters)
             runs = self.runs(parameters, states)
             tally.add(states)
             found[:, rows] = self.values(runs, len(parameters))

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from crashkit.cli._console import names, print_json, say
+from crashkit.cli._progress import Progress
 
 
 def command(
@@ -40,10 +41,11 @@ def command(
     if dataset is None and box is None:
         raise typer.BadParameter("give a dataset, or a box with --box box.yaml", param_hint="DATASET|--box")
     refuse_there([output], overwrite)
-    table = propose(
-        dataset, count, box=box, method=method, seed=seed,  # type: ignore[arg-type]
-        odd=tuple(names(odd)),
-    )  # fmt: skip
+    with Progress(f"reading {dataset or box}", quiet=json) as shown:
+        table = propose(
+            dataset, count, box=box, method=method, seed=seed,  # type: ignore[arg-type]
+            odd=tuple(names(odd)), report=shown.step,
+        )  # fmt: skip
     write_table(table, output)
     now, after = table.attrs.get("expected_error_m"), table.attrs.get("expected_error_after_m")
     if json:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -88,6 +89,8 @@ class ComparedModel:
         Trainings, with this seed and the next ones, that it is the mean of.
     configuration
         Its settings, for the methods section; without the seed, models of one kind agree in it.
+    beneath
+        What else it was trained on than the dataset, such as the checksum of coarse runs; empty for nothing.
     known
         What was put in before the first run, a sentence by its name: inputs, clock, symmetry.
     worth
@@ -106,9 +109,15 @@ class ComparedModel:
     seed: int | None = None
     averaged: int = 1
     configuration: Mapping[str, object] = field(default_factory=dict)
+    beneath: str = ""
     known: Mapping[str, str] = field(default_factory=dict)
     worth: Mapping[str, float] = field(default_factory=dict)
     hard: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    @property
+    def kind(self) -> str:
+        """What models that differ in nothing but the seed have in common."""
+        return json.dumps([self.configuration, self.beneath], sort_keys=True, default=str)
 
 
 def array_names(models: Sequence[ComparedModel]) -> dict[tuple[str, str], str]:

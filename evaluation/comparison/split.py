@@ -7,7 +7,6 @@ against each other.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -120,7 +119,7 @@ def entries(models: Sequence[ComparedModel], seeds_as_spread: bool = True) -> tu
         raise EvaluationError("no model to evaluate; give at least one model folder")
     rows: dict[tuple[str, str], list[tuple[Key, Predictor]]] = {}
     for m, model in enumerate(models):
-        kind = json.dumps(model.configuration, sort_keys=True, default=str) if seeds_as_spread else f"model {m}"
+        kind = model.kind if seeds_as_spread else f"model {m}"
         for p, predictor in enumerate(model.predictors):
             rows.setdefault((predictor.name, kind), []).append(((m, p), predictor))
     for members in rows.values():

@@ -64,7 +64,7 @@ def select(evaluation: Evaluation) -> FromFile | None:
         return None
     finest = best.predictors[0].name
     # Where the best model is a further seed, the file holds the first seed of its row.
-    first = next(m for m in evaluation.first_seeds if m.configuration == best.configuration)
+    first = next(m for m in evaluation.first_seeds if m.kind == best.kind)
     return FromFile(found[0], finest, array_names(evaluation.first_seeds)[first.name, finest])
 
 

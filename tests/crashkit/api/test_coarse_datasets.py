@@ -95,6 +95,12 @@ def test_what_does_not_match_is_refused_in_one_line(changes: dict[str, object], 
     assert "\n" not in str(refused.value)
 
 
+def test_the_fine_runs_themselves_are_no_coarse_runs() -> None:
+    fine = dataset(9, range(6))
+    with pytest.raises(DataError, match=r"is .* itself; expected further runs"):
+        crashkit.train(fine, model="pod-gpr", settings=OFF, coarse=fine)
+
+
 def test_other_models_refuse_coarse_runs_before_they_are_read() -> None:
     with pytest.raises(SurrogateError, match="beneath pod-gpr"):
         crashkit.train(dataset(9, range(6)), model="pod-rbf", coarse="no_such.zarr")

@@ -23,6 +23,7 @@ from evaluation.scatter.result import ScatterResult
 from surrogates.data.campaign import Labels
 from surrogates.doubt import BandDoubt, ProcessDoubt, doubt_of
 from surrogates.settings import settings
+from surrogates.surrogate import Surrogate
 from surrogates.training.train import train_surrogate
 from surrogates.uncertainty import Spread
 
@@ -113,6 +114,21 @@ def test_draws_outside_the_trained_range_are_told(model: crashkit.Model) -> None
     assert wide.limits[0].outside > 0
 
 
+def test_a_draw_at_which_the_model_has_no_numbers_is_named(
+    model: crashkit.Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    predicted = Surrogate.predict_full
+
+    def slow_is_nan(self: Surrogate, parameters: np.ndarray, *more: object) -> np.ndarray:
+        out = predicted(self, parameters, *more)  # type: ignore[arg-type]
+        out[parameters[:, 0] < 10.0] = np.nan
+        return out
+
+    monkeypatch.setattr(Surrogate, "predict_full", slow_is_nan)
+    with pytest.raises(DataError, match=r"a draw with impact_speed \d.* m s-1 gives numbers that are not finite"):
+        scatter(model, {"impact_speed": "40%"}, draws=64)
+
+
 @pytest.mark.parametrize(
     ("vary", "more", "said"),
     [
@@ -120,6 +136,7 @@ def test_draws_outside_the_trained_range_are_told(model: crashkit.Model) -> None
         ({}, {}, "nothing scatters"),
         ({"impact_angle": "5%"}, {"at": {"impact_angle": 0}}, "the nominal value is zero"),
         ({"impact_speed": "2kg"}, {}, "the unit 'kg' is not one of impact_speed"),
+        ({"impact_speed": "2furlongs"}, {}, "impact_speed=2furlongs: unit 'furlongs' is not known"),
         ({"impact_speed": "5%:triangle"}, {}, "'triangle' is no kind of scatter"),
         ({"impact_speed": "0"}, {}, "expected a width above zero"),
         ({"impact_speed": "1"}, {"at": {"impact_speed": 99}}, "far outside"),

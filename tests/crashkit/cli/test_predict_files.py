@@ -63,6 +63,17 @@ def test_files_that_are_there_are_replaced_only_when_asked_for(model: Path, tmp_
     assert np.load(tmp_path / "run.npz")["time"].tolist() == [0.015, 0.03]
 
 
+@pytest.mark.parametrize("output", ["out", "out.npz", "d3plot"])
+def test_rows_that_would_share_a_file_are_named_before_any_is_predicted(
+    model: Path, tmp_path: Path, output: str
+) -> None:
+    table = tmp_path / "runs.csv"
+    table.write_text("run,impact_speed,impact_angle,yield_stress [MPa]\nx/y,15,0,300\nX-Y,20,5,400\n")
+    code, _, err = run("predict", model, "--params", table, "-o", tmp_path / output)
+    assert (code, "runs.csv: rows 'x/y' and 'X-Y' would both be written to" in err) == (1, True)
+    assert not list(tmp_path.glob(f"{output.split('.')[0]}*"))
+
+
 def test_a_row_that_cannot_be_predicted_is_named_before_any_is(model: Path, tmp_path: Path) -> None:
     table = tmp_path / "runs.csv"
     table.write_text("run,impact_speed,impact_angle,yield_stress [MPa]\na,15,0,300\nb,20,5,40000\n")

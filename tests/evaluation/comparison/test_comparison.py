@@ -82,6 +82,11 @@ def test_different_settings_are_no_seeds(models):
     assert [e.label for e in entries((models[1], other))] == ["PODNN (podnn)", "PODNN (wide)"]
 
 
+def test_models_on_different_coarse_runs_are_no_seeds(models):
+    other = replace(models[1], name="beneath", seed=1, beneath="3f2a")
+    assert [e.label for e in entries((models[1], other))] == ["PODNN (podnn)", "PODNN (beneath)"]
+
+
 def test_one_model_given_twice_is_refused(models):
     with pytest.raises(EvaluationError, match="one model given twice"):
         entries((models[1], replace(models[1], name="copy")))
