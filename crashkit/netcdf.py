@@ -73,7 +73,7 @@ class SharedFile(FileManager):  # type: ignore[type-arg]
 
 
 def default_indexes(wanted: bool) -> dict[str, Any]:
-    """What `xarray.open_dataset` is told so; older versions make them in any case."""
+    """The argument of `xarray.open_dataset` that asks for indexes or not; older versions lack it and always make them."""
     import xarray as xr
 
     known = "create_default_indexes" in inspect.signature(xr.open_dataset).parameters

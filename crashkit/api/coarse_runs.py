@@ -216,7 +216,7 @@ def _parts(found: Campaign, campaign: Campaign, name: str) -> NDArray[np.int64]:
 
 
 def _keys(here: Labels, there: Labels) -> bool:
-    """Whether parts are told apart by their names: each fine part with faces has a name of its own that the coarse mesh has."""
+    """Whether parts can be matched by name: every fine part with faces has a name that no other has, and the coarse mesh has it."""
     import numpy as np
 
     wanted = [there.part_name[p] for p in np.unique(there.face_part)]

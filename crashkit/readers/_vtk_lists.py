@@ -63,7 +63,7 @@ def xml_type(file: Path) -> str:
 
 
 def listed_states(file: Path) -> tuple[list[ListedState], tuple[str, ...]]:
-    """The states of a PVD collection or of a file series by their times, and what there is to say about the list.
+    """The states of a PVD collection or of a file series in the order of their times, and a sentence for each oddity of the list.
 
     A solver that is started again appends to the list of its first start: a state listed twice is one state, and the
     last entry of each part counts.

@@ -125,13 +125,13 @@ def _members(surrogate: Surrogate) -> list[str]:
 
 
 def _elements(surrogate: Surrogate) -> list[str]:
-    """How well removal, and results on elements, are told of training runs that folds left out."""
+    """Errors of removal and of results on elements, on training runs that folds left out."""
     out: list[str] = []
     removal = surrogate.removal
     if removal is not None:
         out += ["", "## Removal of elements", ""]
         out.append(
-            f"{len(removal.faces)} elements disappear in some training run or its image. How likely each is gone is told by: "
+            f"{len(removal.faces)} elements disappear in some training run or its image. How likely each is gone is predicted from: "
             f"{', '.join(removal.terms)}."
         )
         rows = [
@@ -155,7 +155,7 @@ def _elements(surrogate: Surrogate) -> list[str]:
 
 
 def _curves(surrogate: Surrogate) -> list[str]:
-    """How well time histories are told of training runs that folds left out."""
+    """Errors of time histories on training runs that folds left out."""
     rows = []
     for name, curve in surrogate.curves.items():
         size = float(np.sqrt(np.square(curve.values @ curve.modes).mean()))
