@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,19 +33,26 @@ class TrainedProcess:
     ----------
     scale
         (parameter,) SI value of one unit of the box.
+    fixed
+        Parameters that are the same in all runs and that the box does not name, in the units of the model.
     """
 
     surrogate: Surrogate
     box: Box
     scale: NDArray[np.float64]
+    fixed: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def of(cls, surrogate: Surrogate, box: Box) -> TrainedProcess:
         """Raises CampaignError where the box is not that of the model."""
         from data_schema import to_si
 
-        names, units = surrogate.record.ranges.names, surrogate.record.ranges.units
-        missing = sorted(set(names) ^ set(box.names))
+        ranges = surrogate.record.ranges
+        names, units = ranges.names, ranges.units
+        fixed = {
+            n: float(a) for n, a, b in zip(names, ranges.low, ranges.high, strict=True) if a == b and n not in box.names
+        }
+        missing = sorted((set(names) - set(fixed)) ^ set(box.names))
         if missing:
             raise CampaignError(
                 f"the box and the runs differ in {', '.join(missing)}; the runs have {', '.join(names)}, the box "
@@ -59,16 +67,19 @@ class TrainedProcess:
                     f"{name} is in {unit or 'no unit'} in the box and in {own or 'no unit'} in the runs"
                 )
             factors.append(mine / theirs)
-        return cls(surrogate, box, np.array(factors))
+        return cls(surrogate, box, np.array(factors), fixed)
 
     def parameters(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """(point, parameter) of the box -> in the order and units of the model."""
-        order = [self.box.names.index(n) for n in self.surrogate.record.ranges.names]
-        return np.asarray((points * self.scale)[:, order])
+        given = points * self.scale
+        columns = [
+            given[:, self.box.names.index(n)] if n in self.box.names else np.full(len(given), self.fixed[n])
+            for n in self.surrogate.record.ranges.names
+        ]
+        return np.stack(columns, axis=1)
 
-    def of_runs(self, runs: tuple[list[str], list[str], NDArray[np.float64]]) -> NDArray[np.float64]:
-        """(run, parameter) of a dataset's names, units and values, in the order of the model."""
-        names, _, values = runs
+    def of_runs(self, names: Sequence[str], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(run, parameter) of a dataset's names and values, in the order of the model."""
         return values[:, [names.index(n) for n in self.surrogate.record.ranges.names]]
 
     def points(self, seed: int, count: int) -> NDArray[np.float64]:

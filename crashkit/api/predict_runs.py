@@ -144,7 +144,7 @@ def predict_runs(
     parameters
         Values by name, as `crashkit.Model.predict` takes them.
     table
-        A table of parameters: every row is predicted.
+        A table of parameters: every row is predicted, under its name in the column `run`, else as row_2, row_3, ...
     run, dataset
         A run of this dataset, by name or place: it is written with the truth beside it and the error.
     time, level, full, extrapolate, band, sensitivity
@@ -346,7 +346,7 @@ def _of_table(record: Record, output: Path, table: Path) -> list[_Wanted]:
             if output.suffix
             else output / f"{file_name(row)}.pvd",
         )
-        for row, values in read_parameter_table(table).rows.items()
+        for row, values in read_parameter_table(table, numbered=True).rows.items()
     ]
     rows: dict[str, str] = {}  # by the file's name, in which some systems do not tell capitals apart
     for one in wanted:

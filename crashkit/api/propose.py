@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -48,8 +52,10 @@ def propose(
     Returns
     -------
     pandas.DataFrame
-        Columns are the parameters, in the units of `box` (of the dataset without one); `attrs["units"]` says which,
-        and, where a model was asked, `attrs["expected_error_m"]` and `attrs["expected_error_after_m"]`.
+        Columns are the parameters, in the units of `box` (without one, of the table the dataset's parameters came from);
+        `attrs["units"]` says which, and, where a model was asked, `attrs["expected_error_m"]` and
+        `attrs["expected_error_after_m"]`. The index has names for the runs that go on with those of the dataset.
+        Parameters of the dataset that the box does not name are there, too, if all runs have one value.
 
     Raises
     ------
@@ -64,10 +70,12 @@ def propose(
 
     if count < 1:
         raise CampaignError(f"{count} runs were asked for; expected at least 1")
+    if box is None and dataset is None:
+        raise CampaignError("neither a dataset nor a box was given; give a dataset, or --box box.yaml")
+    known = None if dataset is None else _known(dataset)
     if box is None:
-        if dataset is None:
-            raise CampaignError("neither a dataset nor a box was given; give a dataset, or --box box.yaml")
-        box = Box.of_values(*_parameters(dataset))
+        assert known is not None
+        box = Box.of_values(known.names, [u for u, _ in known.written], known.as_written)
     elif not isinstance(box, Box):
         box = read_box(box)
     if dataset is None or method != "expected-reduction":
@@ -77,31 +85,76 @@ def propose(
         )  # fmt: skip
         about: dict[str, float] = {}
     else:
-        points, about = _most_useful(dataset, box, count, seed, odd, report)
+        assert known is not None
+        points, about = _most_useful(dataset, known, box, count, seed, odd, report)
     table = pd.DataFrame([[float(f"{v:.7g}") for v in row] for row in points], columns=list(box.names))
     table.attrs["units"] = dict(zip(box.names, box.units, strict=True))
+    for name, (value, unit) in ({} if known is None else known.constant).items():
+        if name not in box.names:
+            table[name] = value
+            table.attrs["units"][name] = unit
+    table.index = pd.Index(next_names([] if known is None else known.runs, count), name="run")
     table.attrs.update(about)
     return table
 
 
-def _parameters(dataset: str | Path) -> tuple[list[str], list[str], NDArray[np.float64]]:
-    """Names, units and values (run, parameter) of a dataset's parameters."""
+def next_names(runs: Sequence[str], count: int) -> list[str]:
+    """Names for `count` runs more, which go on with the numbers of `runs`: run_036 after run_035.
+
+    Without a number to go on with they are run_000, ...
+    """
+    found = [m for name in runs if (m := re.fullmatch(r"(.*?)(\d+)", name))]
+    last = max(found, key=lambda m: int(m[2]), default=None)
+    stem, number, width = ("run_", -1, 3) if last is None else (last[1], int(last[2]), len(last[2]))
+    taken = {name.lower() for name in runs}
+    names = (f"{stem}{k:0{width}d}" for k in itertools.count(number + 1))
+    return list(itertools.islice((name for name in names if name.lower() not in taken), count))
+
+
+@dataclass(frozen=True)
+class _Known:
+    """The runs of a dataset: their names, and names and values (run, parameter) of the parameters.
+
+    written  (unit, its value in the dataset's unit) of the table the parameters came from
+    """
+
+    runs: list[str]
+    names: list[str]
+    written: list[tuple[str, float]]
+    values: NDArray[np.float64]
+
+    @property
+    def as_written(self) -> NDArray[np.float64]:
+        """(run, parameter) in the units of the table."""
+        return self.values / [factor for _, factor in self.written]
+
+    @property
+    def constant(self) -> dict[str, tuple[float, str]]:
+        """Value and unit in the table of each parameter that is the same in all runs."""
+        return {
+            name: (float(f"{column[0]:.7g}"), unit)
+            for name, (unit, _), column in zip(self.names, self.written, self.as_written.T, strict=True)
+            if column.min() == column.max()
+        }
+
+
+def _known(dataset: str | Path) -> _Known:
     import numpy as np
 
     from crashkit.campaign.box import CampaignError
     from crashkit.dataset import opened_dataset
-    from data_schema import parameters
+    from data_schema import parameters, table_unit
 
     with opened_dataset(dataset) as opened:
         names = parameters(opened)
         if not names:
             raise CampaignError(f"{dataset}: no run has a parameter; give them with crashkit ingest --params")
         values = np.stack([opened[n].values.astype(np.float64) for n in names], axis=1)
-        return names, [str(opened[n].attrs.get("units", "")) for n in names], values
+        return _Known([str(n) for n in opened["sim"].values], names, [table_unit(opened, n) for n in names], values)
 
 
 def _most_useful(
-    dataset: str | Path, box: Box, count: int, seed: int, odd: tuple[str, ...], report: Progress | None
+    dataset: str | Path, runs: _Known, box: Box, count: int, seed: int, odd: tuple[str, ...], report: Progress | None
 ) -> tuple[NDArray[np.float64], dict[str, float]]:
     """The points that lower the error over the box most, by a process trained on all runs; and what is expected of them."""
     import tempfile
@@ -118,27 +171,37 @@ def _most_useful(
     if report is not None:
         report("choosing the next runs", 0, 0, "")
     known = TrainedProcess.of(surrogate, box)
-    points, share = known.best(known.of_runs(_parameters(dataset)), count, seed)
+    points, share = known.best(known.of_runs(runs.names, runs.values), count, seed)
     error = known.judge(0.9, seed).error
     return points, {"expected_error_m": error, "expected_error_after_m": error * share}
 
 
+def check_table_name(output: Path) -> None:
+    """Raise OutputError where `output` does not end as the tables that `write_table` writes."""
+    from crashkit.errors import OutputError
+
+    if output.suffix.lower() != ".csv":
+        raise OutputError(f"{output}: a table is written as CSV; expected a name that ends in .csv")
+
+
 def write_table(table: pd.DataFrame, output: str | Path) -> None:
-    """Write what `propose` returns as CSV, with the unit of each parameter in its heading.
+    """Write what `propose` returns as CSV, the unit of each parameter in its heading: as `crashkit predict --params`,
+    `crashkit campaign --runs` and `crashkit ingest --params` read it.
 
     Raises
     ------
     OutputError
-        Where `output` cannot be written.
+        Where `output` cannot be written, or is no name of such a table.
     """
     from crashkit.errors import OutputError
     from data_schema.replace import beside
 
     output = Path(output)
+    check_table_name(output)
     heads = [n if u in ("", "1") else f"{n} ({u})" for n, u in table.attrs["units"].items()]
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         with beside(output) as new:
-            table.to_csv(new, index=False, header=heads)
+            table.to_csv(new, header=heads, index_label="run")
     except OSError as error:
         raise OutputError(f"{output}: cannot be written ({error.strerror or error}); choose another with -o") from error

@@ -101,7 +101,8 @@ class Box(BaseModel):
         }
         if not ranges:
             raise CampaignError("no parameter differs between the runs; give the box with --box")
-        return cls(parameters=ranges)
+        # Without constraints, a name need not be one that they can speak of ("2nd_impact").
+        return cls.model_construct(parameters=ranges, constraints=())
 
 
 def _condition(text: str, names: tuple[str, ...]) -> Callable[[Mapping[str, float]], bool]:

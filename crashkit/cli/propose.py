@@ -32,7 +32,7 @@ def command(
     """Propose the next runs: without a dataset they fill the box, with one they lower its error most."""
     from typing import get_args
 
-    from crashkit.api.propose import propose, write_table
+    from crashkit.api.propose import check_table_name, propose, write_table
     from crashkit.campaign.plan import Method
     from crashkit.output import refuse_there
 
@@ -40,6 +40,7 @@ def command(
         raise typer.BadParameter(f"{method!r}; expected one of {', '.join(get_args(Method))}", param_hint="--method")
     if dataset is None and box is None:
         raise typer.BadParameter("give a dataset, or a box with --box box.yaml", param_hint="DATASET|--box")
+    check_table_name(output)
     refuse_there([output], overwrite)
     with Progress(f"reading {dataset or box}", quiet=json) as shown:
         table = propose(
@@ -49,7 +50,7 @@ def command(
     write_table(table, output)
     now, after = table.attrs.get("expected_error_m"), table.attrs.get("expected_error_after_m")
     if json:
-        print_json({"output": output, "runs": table.to_dict("records"), **table.attrs})
+        print_json({"output": output, "runs": table.reset_index().to_dict("records"), **table.attrs})
         return
     if now is not None and after is not None:
         say(f"expected error over the box: {1e3 * now:.2f} mm now, {1e3 * after:.2f} mm with these {len(table)} runs")

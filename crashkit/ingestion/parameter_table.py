@@ -110,8 +110,10 @@ def _one_form(name: str) -> str:
     return unicodedata.normalize("NFC", name)
 
 
-def read_parameter_table(path: Path) -> ParameterTable:
+def read_parameter_table(path: Path, *, numbered: bool = False) -> ParameterTable:
     """The table at `path`, read by its suffix.
+
+    numbered  a table without a column of runs is taken, too: its rows are called row_2, row_3, ... as in the file
 
     Raises
     ------
@@ -125,11 +127,14 @@ def read_parameter_table(path: Path) -> ParameterTable:
     if len(keys) > 1:
         told = " and ".join(repr(table.header[k]) for k in keys)
         raise ReadError(f"{path}: columns {told} could both name the runs; rename one of them")
-    key = keys[0] if keys else None
-    if key is None:
+    if not keys and not numbered:
         raise ReadError(
-            f"{path}: no column called run; its columns are {', '.join(filter(None, table.header)) or 'none'}"
+            f"{path}: no column called run; its columns are {', '.join(filter(None, table.header)) or 'none'}; add one "
+            "with the names of the runs"
         )
+    if not keys:
+        table = _Table(["run", *table.header], [(number, ["", *line]) for number, line in table.lines])
+    key, numbered = (keys[0], False) if keys else (0, True)
     chosen = [k for k, c in enumerate(table.header) if k != key and _plain(c) not in _KEYS]
     others = [k for k in range(len(table.header)) if k != key and k not in chosen]
     columns = parameter_columns([table.header[k] for k in chosen], [""] * len(chosen), str(path))
@@ -144,7 +149,7 @@ def read_parameter_table(path: Path) -> ParameterTable:
     rows: dict[str, dict[str, tuple[float, str]]] = {}
     twice: list[str] = []
     for number, line in body:
-        run = _text(line[key])
+        run = f"row_{number}" if numbered else _text(line[key])
         if not run:
             raise ReadError(f"{path}: row {number} names no run in column {table.header[key]!r}")
         if run in rows:
