@@ -85,7 +85,7 @@ def test_without_runs_proposals_fill_the_box(study: Path, tmp_path: Path) -> Non
     result = CliRunner().invoke(app, ["propose", "--box", str(study), "-n", "6", "-o", str(tmp_path / "first.csv")])
     assert result.exit_code == 0, result.output
     table = pd.read_csv(tmp_path / "first.csv")
-    assert list(table.columns) == ["speed (m/s)", "stiffness (kN/m)", "offset (mm)"]
+    assert list(table.columns) == ["run", "speed (m/s)", "stiffness (kN/m)", "offset (mm)"]
     assert (table["speed (m/s)"].min(), table["speed (m/s)"].max()) == (4, 12)
 
 
