@@ -1,4 +1,4 @@
-"""What the bumper study trains. Nothing was tuned on this structure: choices are the defaults', or those of the kart study."""
+"""What the bumper study trains. Nothing was tuned on this structure: choices are the defaults', or were made on the kart frame."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SIZES = (8, 12, 24, 48)  # fewer training runs, for the learning curves
 PHYSICS = ("physics.odd=[pole_offset]",)
 WITHOUT = ("inputs.derived=off", "physics.clock=off", "physics.symmetry=off")
 
-# Epochs as in the kart study, which has as many runs; everything else is the fast preset.
+# Epochs that were chosen on validation runs of the kart frame, of which there are as many; everything else is the fast preset.
 EPOCHS = ("level.epochs=75",)
 CASCADE = (*EPOCHS, "transfer.epochs=0.2", "at.1.epochs=8")
 LATENT = 48  # the cascade's latent numbers in the fast preset

@@ -68,10 +68,9 @@ class Plan:
         Models compared in the report, each trained with every seed.
     curves, sizes
         Models whose learning curves are drawn, and the smaller numbers of training runs.
-    beside
-        Models of the full study that are trained with every seed and stand in no table of the report.
-    alternatives
-        Models of the full study that are judged on validation runs alone.
+    once
+        Models of the full study that are trained with the first seed alone and stand in no table of the report, such as a
+        published setting.
     unit
         Of lengths in tables: cm or mm.
     coarse
@@ -85,8 +84,7 @@ class Plan:
     table: tuple[Kind, ...]
     curves: tuple[Kind, ...] = ()
     sizes: tuple[int, ...] = ()
-    beside: tuple[Kind, ...] = ()
-    alternatives: tuple[Kind, ...] = ()
+    once: tuple[Kind, ...] = ()
     unit: str = "cm"
     coarse: str = ""
 
@@ -100,7 +98,7 @@ class Plan:
         return self.sizes[:1] if short else self.sizes
 
     def jobs(self, seeds: int, short: bool = False) -> list[Job]:
-        """All trainings: the first seed of the table, learning curves, further seeds, what is slow, what else was tried.
+        """All trainings: the first seed of the table, learning curves, further seeds, what is slow, what is trained once.
 
         The short ones have one point of the learning curves beside all training runs.
         """
@@ -108,10 +106,9 @@ class Plan:
         table = [Job(shape(kind), seed) for seed in range(seeds) for kind in self.table]
         fast = [job for job in table if job.kind.model not in SLOW]
         curves = [Job(shape(kind), 0, runs) for runs in (None, *self.few(short)) for kind in self.curves]
-        other = [] if short else [Job(kind, seed) for kind in self.beside for seed in range(seeds)]
-        other += [] if short else [Job(kind) for kind in self.alternatives]
+        once = [] if short else [Job(kind) for kind in self.once]
         first = [job for job in fast if job.seed == 0]
-        return list(dict.fromkeys([*first, *curves, *fast, *table, *other]))
+        return list(dict.fromkeys([*first, *curves, *fast, *table, *once]))
 
     def compared(self, seeds: int, short: bool = False) -> list[Job]:
         """The trainings whose models the report compares."""

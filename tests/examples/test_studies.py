@@ -216,10 +216,12 @@ def test_curves_of_two_structures_stand_side_by_side_in_their_own_units(kart, tm
     ]  # fmt: skip
 
 
-def test_ratios_are_taken_between_models_that_are_there(kart):
-    found = kart["results"].goals({"MH1": 1.0, "MH2": 1.25, "PODNN": 4.0})
-    assert found["ratio"] == ["MH1 / PODNN", "MH1 / MH2"]
-    assert found["found"] == [0.25, 0.8]
+def test_goals_stand_beside_the_models_that_are_there(kart):
+    curves = kart["tables"].LearningCurves((48, 96), {"MH1": [0.01, 0.009], "POD-GPR": [np.nan, 0.007]})
+    found = kart["results"].reached({"MH1": 0.008}, curves, 96)
+    assert found["MH1", 96] == 0.008, "the mean over seeds, where there are several"
+    shown = kart["results"].goals(found)
+    assert list(zip(*shown.values())) == [("MH1", 96, 0.8, 0.61), ("MH1", 48, 1.0, 0.8)]
 
 
 @pytest.fixture
@@ -286,10 +288,12 @@ def test_a_quick_study_leaves_report_tables_and_curves_and_does_nothing_twice(ka
     folder = tmp_path / "s" / "quick" / "results"
     assert {p.stem for p in folder.glob("*.md")} == {
         "table",
-        "coarse",
-        "paper",
+        "intervals",
+        "frontal",
         "averaged",
         "goals",
+        "coarse",
+        "worth",
         "regressions",
         "not_trained",
     }
