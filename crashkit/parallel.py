@@ -127,6 +127,8 @@ def _ends_at_once(processes: Sequence[BaseProcess]) -> Callable[..., None]:
         if kind is not None and issubclass(kind, KeyboardInterrupt):
             for process in processes:
                 process.kill()
+            for process in processes:
+                process.join(1.0)
 
     return end
 

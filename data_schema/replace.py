@@ -50,7 +50,7 @@ def beside(target: str | Path, *, durable: bool = False) -> Iterator[Path]:
 def room_beside(target: Path) -> Iterator[Path]:
     """A hidden folder beside `target`, on the same disk, gone afterwards; so are those that killed processes left."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    _sweep(target)
+    sweep(target)
     room = Path(tempfile.mkdtemp(prefix=f"{_mark(target)}{os.getpid()}.", suffix=".part", dir=target.parent))
     try:
         yield room
@@ -63,8 +63,8 @@ def _mark(target: Path) -> str:
     return f".{target.name}.{re.sub('[^A-Za-z0-9]', '-', platform.node()) or 'here'}."
 
 
-def _sweep(target: Path) -> None:
-    """Delete hidden folders whose process has ended."""
+def sweep(target: Path) -> None:
+    """Delete the hidden folders beside `target` whose process has ended."""
     mark = _mark(target)
     for left in target.parent.glob(f"{glob.escape(mark)}*.part"):
         process = left.name.removeprefix(mark).split(".")[0]

@@ -8,7 +8,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from crashkit.api.series import SeriesNote, stored_model
 from data_schema.progress import Progress, silent
+from data_schema.replace import sweep
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -76,6 +78,8 @@ class PredictedRun:
         nothing is said of them.
     numbers
         Name -> value, unit and half_width (with a band) of each number by formula; None without any.
+    resumed
+        It was written before, by the series that was resumed.
     """
 
     run: str
@@ -94,10 +98,17 @@ class PredictedRun:
     expected_removed: float | None = None
     hidden: int | None = None
     numbers: dict[str, dict[str, Any]] | None = None
+    resumed: bool | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """As plain values, without those that are None."""
         return {name: value for name, value in asdict(self).items() if value is not None}
+
+    @classmethod
+    def of_dict(cls, values: Mapping[str, Any]) -> PredictedRun:
+        """What `as_dict` gave."""
+        band = values.get("band")
+        return cls(**{**values, "band": None if band is None else PredictedBand(**band)})
 
 
 @dataclass(frozen=True)
@@ -129,6 +140,7 @@ def predict_runs(
     coarse_run: str | Path | None = None,
     workers: int = 1,
     overwrite: bool = False,
+    resume: bool = False,
     report: Progress = silent,
 ) -> list[PredictedRun]:
     """Predict runs and write them. Give one of `parameters`, `table` and `run`.
@@ -160,6 +172,9 @@ def predict_runs(
         Processes that share the rows of a table; the model must then be a folder.
     overwrite
         Replace files that are there; without it they are refused before anything is predicted.
+    resume
+        Go on with a table that was interrupted, or has got further rows: what is written stays. Only with the same model
+        and the same further arguments.
     report
         Called with (what, runs done, runs, "").
 
@@ -173,7 +188,7 @@ def predict_runs(
         Where `output` cannot be written, or is there.
     """
     from crashkit.api.predict import model_in_hand
-    from crashkit.errors import DataError
+    from crashkit.errors import DataError, OutputError
     from crashkit.output import refuse_there
     from crashkit.parallel import as_finished
 
@@ -183,28 +198,70 @@ def predict_runs(
 
         parameters = own_parameters(coarse_run, asked.record.ranges.names)
     wanted = _wanted(asked.record, Path(output), parameters, table, run, dataset)
-    refuse_there((one.output for one in wanted), overwrite)
-    if table is not None:
-        _check_rows(asked, wanted, table, time, extrapolate)
     how = _How(
         time, level, full, extrapolate, band, sensitivity, hide_above, template, coarse_run, several=table is not None
     )
-    if workers == 1 or len(wanted) == 1:
-        rows = []
-        for k, one in enumerate(wanted):
-            report(f"predicting {one.run or asked.name}", k, len(wanted) if len(wanted) > 1 else 0, "")
-            rows.append(_one(asked, one, how))
-        return rows
+    series = None if table is None or asked.folder is None else SeriesNote(Path(output), _identity(asked.folder, how))
+    if resume and series is None:
+        raise DataError("resume goes on with the rows of a table, by a model in its folder; give both")
+    found = _written_before(series, wanted) if series is not None and resume else {}
+    if series is not None and not (resume or overwrite) and series.is_there():
+        raise OutputError(
+            f"{output}: holds runs of a series; go on with it with --resume, replace it with --overwrite, or choose another "
+            "place"
+        )
+    refuse_there((one.output for one in wanted if series is None or not series.owns(one.output)), overwrite)
+    if table is not None:
+        _check_rows(asked, wanted, table, time, extrapolate)
+    if series is not None:
+        series.begin(one.output for one in wanted)
+    left = [k for k in range(len(wanted)) if k not in found]
+
+    def keep(place: int, row: PredictedRun) -> None:
+        found[place] = row
+        if series is not None:
+            summary = {name: value for name, value in row.as_dict().items() if name != "files"}
+            series.add(row.run, wanted[place].parameters, row.files, summary)
+
+    if workers == 1 or len(left) < 2:
+        for k in left:
+            one = wanted[k]
+            report(f"predicting {one.run or asked.name}", len(found), len(wanted) if len(wanted) > 1 else 0, "")
+            keep(k, _one(asked, one, how))
+        return [found[k] for k in range(len(wanted))]
     if asked.folder is None:
         raise DataError("several processes each load the model; give its folder, or workers=1")
-    found: dict[int, PredictedRun] = {}
-    report("runs", 0, len(wanted), "")
-    for place, row in as_finished(
-        _one_elsewhere, wanted, (asked.folder.resolve(), how), workers=workers, label=lambda w: w.run
-    ):
-        found[place] = row
-        report("runs", len(found), len(wanted), wanted[place].run)
+    report("runs", len(found), len(wanted), "")
+    try:
+        for place, row in as_finished(
+            _one_elsewhere, [wanted[k] for k in left], (asked.folder.resolve(), how), workers=workers,
+            label=lambda w: w.run,
+        ):  # fmt: skip
+            keep(left[place], row)
+            report("runs", len(found), len(wanted), row.run)
+    except KeyboardInterrupt:
+        for one in wanted:  # what killed processes were writing
+            sweep(one.output)
+        raise
     return [found[k] for k in range(len(wanted))]
+
+
+def _identity(folder: Path, how: _How) -> dict[str, Any]:
+    """What must be the same for a series to go on: the model, and what all runs are asked alike."""
+    import numpy as np
+
+    asked = {name: value for name, value in vars(how).items() if name not in ("several", "extrapolate")}
+    asked["time"] = None if how.time is None else np.ravel(how.time).astype(float).tolist()
+    for name in ("template", "coarse_run"):
+        asked[name] = None if asked[name] is None else str(asked[name])
+    return {"model": stored_model(folder), **asked}
+
+
+def _written_before(series: SeriesNote, wanted: Sequence[_Wanted]) -> dict[int, PredictedRun]:
+    """Place -> run, of those that the series has written already. Raises OutputError for another series."""
+    series.read()
+    summaries = ((k, series.whole(one.run, one.parameters)) for k, one in enumerate(wanted))
+    return {k: PredictedRun.of_dict({**summary, "resumed": True}) for k, summary in summaries if summary is not None}
 
 
 def _check_rows(

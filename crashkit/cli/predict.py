@@ -89,6 +89,10 @@ def command(
     write_series: Annotated[
         bool, typer.Option("--write-series", help="With --params: write the rows in parallel, on all processors.")
     ] = False,
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="With --params: go on with a table that was interrupted; what is written stays."),
+    ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
@@ -97,6 +101,8 @@ def command(
         fail("give one of --param, --params and --run", code=2)
     if write_series and params is None:
         fail("--write-series writes the rows of a table; give it with --params runs.csv", code=2)
+    if resume and params is None:
+        fail("--resume goes on with the rows of a table; give it with --params runs.csv", code=2)
     if bool(run) != (dataset is not None):
         fail("--run and --dataset belong together: --run run_008 --dataset crash.zarr", code=2)
     asked = None if params is not None or run else given(param or ())
@@ -110,15 +116,18 @@ def command(
                 dataset=dataset, time=times, level=level, full=full or None, extrapolate=extrapolate, band=band,
                 sensitivity=sensitivity, template=template, workers=(os.cpu_count() or 1) if write_series else 1,
                 coarse_run=coarse_run or None,
-                hide_above=hide_above, overwrite=overwrite, report=shown.step,
+                hide_above=hide_above, overwrite=overwrite, resume=resume, report=shown.step,
             )  # fmt: skip
         except KeyboardInterrupt:
-            kept = "; the runs written until then stay, each whole" if params is not None else ""
+            kept = "; the runs written until then stay, each whole: go on with --resume" if params is not None else ""
             fail(f"interrupted{kept}", code=130)
     if json:
         documents = [row.as_dict() for row in rows]
         print_json(documents if params is not None else documents[0])
         return
+    before = sum(row.resumed or False for row in rows)
+    if before:
+        say(f"{before} of {len(rows)} runs were written before, {len(rows) - before} now")
     for row in rows:
         for sentence in row.warnings:
             say(f"warning: {row.run + ': ' if row.run else ''}{sentence}")

@@ -80,3 +80,80 @@ def test_a_row_that_cannot_be_predicted_is_named_before_any_is(model: Path, tmp_
     code, _, err = run("predict", model, "--params", table, "-o", tmp_path / "out")
     assert (code, "runs.csv: run b: yield_stress = " in err) == (1, True)
     assert not (tmp_path / "out").exists()
+
+
+TABLE = "run,impact_speed,impact_angle,yield_stress [MPa]\na,15,0,300\nb,20,5,400\nc,18,2,350\n"
+
+
+@pytest.mark.parametrize("output", ["out", "out.npz"])
+def test_a_series_that_was_interrupted_goes_on(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, output: str
+) -> None:
+    from crashkit.api import predict as api
+
+    table = tmp_path / "runs.csv"
+    table.write_text(TABLE)
+    asked = ("predict", model, "--params", table, "-o", tmp_path / output)
+    write, written = api.write_prediction, []
+
+    def interrupted(*given, **options):
+        if len(written) == 1:
+            raise KeyboardInterrupt
+        written.append(given[1])
+        return write(*given, **options)
+
+    monkeypatch.setattr(api, "write_prediction", interrupted)
+    code, _, err = run(*asked)
+    assert (code, "go on with --resume" in err) == (130, True)
+    first = written[0].read_bytes()
+    assert not list(tmp_path.rglob("*.part"))
+    code, _, err = run(*asked)
+    assert (code, f"{output}: holds runs of a series; go on with it with --resume" in err) == (1, True)
+    code, _, err = run(*asked, "--resume", "--level", 0)
+    assert (code, "begun without --level" in err) == (1, True)
+
+    written = ["none is interrupted"] * 2
+    code, out, err = run(*asked, "--resume", "--json")
+    assert code == 0, err
+    assert [(row["run"], row.get("resumed", False)) for row in json.loads(out)] == [
+        ("a", True),
+        ("b", False),
+        ("c", False),
+    ]
+    assert [path.stem[-1] for path in written[2:]] == ["b", "c"]
+    assert Path(json.loads(out)[0]["files"][0]).read_bytes() == first
+
+
+def test_rows_that_were_added_or_changed_or_lost_are_computed(model: Path, tmp_path: Path) -> None:
+    table = tmp_path / "runs.csv"
+    table.write_text(TABLE)
+    asked = ("predict", model, "--params", table, "-o", tmp_path / "p.npz", "--json")
+    assert run(*asked, "--resume")[0] == 0
+    (tmp_path / "p_a.npz").unlink()
+    table.write_text(TABLE.replace("b,20", "b,21") + "d,17,1,320\n")
+    code, out, err = run(*asked, "--resume")
+    assert code == 0, err
+    assert [row["run"] for row in json.loads(out) if row.get("resumed")] == ["c"]
+    assert float(np.load(tmp_path / "p_b.npz")["impact_speed"]) == 21
+
+
+def test_a_series_never_mixes_two_models_or_takes_files_of_others(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table = tmp_path / "runs.csv"
+    table.write_text(TABLE)
+    other = tmp_path / "other"
+    crashkit.train(
+        dataset(9), other, "pod-gpr", settings=["physics.clock=off", "physics.symmetry=off", "inputs.derived=off"]
+    )
+    assert run("predict", model, "--params", table, "-o", tmp_path / "out")[0] == 0
+    code, _, err = run("predict", other, "--params", table, "-o", tmp_path / "out", "--resume")
+    assert (code, "begun by another model, or the model was trained again" in err) == (1, True)
+    (tmp_path / "q_b.npz").write_text("mine")
+    code, _, err = run("predict", model, "--params", table, "-o", tmp_path / "q.npz", "--resume")
+    assert (code, "q_b.npz: is there already" in err) == (1, True)
+    assert (tmp_path / "q_b.npz").read_text() == "mine"
+    note = next((tmp_path / "out").glob(".*.jsonl"))
+    note.write_text(note.read_text()[:-30])  # killed while it wrote
+    code, out, err = run("predict", model, "--params", table, "-o", tmp_path / "out", "--resume", "--json")
+    assert (code, [row.get("resumed") for row in json.loads(out)]) == (0, [True, True, None]), err
