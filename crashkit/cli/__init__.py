@@ -53,9 +53,11 @@ def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
     def run(*args: Any, **kwargs: Any) -> Any:
         from crashkit.errors import CrashkitError
         from crashkit.extras import explained
+        from data_schema.memory import one_heap
         from evaluation.errors import EvaluationError
         from surrogates.errors import SurrogateError
 
+        one_heap()
         try:
             return command(*args, **kwargs)
         except (CrashkitError, SurrogateError, EvaluationError) as error:
