@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from crashkit.api.model import Model
     from evaluation.measures.formula import Formula, Limit, Value
     from surrogates.data.inputs import Ranges
-    from surrogates.queries.optimum import LocalAnswer, Problem
+    from surrogates.queries.optimum import LocalAnswer, Problem, Sampled
     from surrogates.surrogate import Surrogate
 
 Floats = NDArray[np.float64]
@@ -29,6 +29,8 @@ Floats = NDArray[np.float64]
 _DRAWS, _ROUNDS, _STILL = 200, 6, 0.01
 # A limit within this share of its spread over the box is active.
 _ACTIVE = 0.02
+# A parameter hardly matters where, over its whole range, no number changes by this share of its range over the box.
+_MATTERS, _ALONG = 0.01, 7
 
 
 @dataclass(frozen=True)
@@ -46,9 +48,13 @@ class Optimum:
     limits
         One row a limit, in SI: predicted value, margin (how far the model's error may take it towards the bound), bound,
         slack (what is left with the margin; negative where it is broken), active, probability that it is kept, and price:
-        by how much the value would improve for each unit that the bound is loosened.
+        by how much the value would improve for each unit that the bound is loosened. `attrs["written"]` has the unit in
+        which each limit was written, and its value in SI.
     sensitivities
         One row a parameter: change of the value and of each limit's number for one unit of the parameter's table.
+    table
+        One row a parameter, in the units of its table: value, trained range, and `at`: "given", at an edge of the range, or
+        "hardly matters" where nothing changes over its whole range, so that its value means nothing.
     confirm
         Parameters of the runs to compute next, in the units of the table.
     others
@@ -225,6 +231,14 @@ def optimise(
             if told
             else "limits are not tightened: the model knows nothing of its own error"
         )
+    idle = _idle(problem, box, best)
+    if idle.any():
+        told_idle = [name for name, is_idle in zip(ranges.names, idle, strict=True) if is_idle]
+        notes.append(
+            f"{', '.join(told_idle)} hardly {'matters' if len(told_idle) == 1 else 'matter'} there: over the whole range the "
+            f"value{' and the limits' if bounds else ''} change by less than {100 * _MATTERS:g} % of what they change over the "
+            "box; any value does"
+        )
     limits = _limits(bounds, best, margins, kept, box.scale, problem)
     slopes = Problem(problem.values, ranges.low, ranges.high).slopes(best.parameters)  # by given parameters, too
     factors = np.array([f for _, f in ranges.written])
@@ -238,7 +252,7 @@ def optimise(
         confidence=confidence,
         limits=limits,
         sensitivities=_sensitivities(ranges.names, units, factors, bounds, slopes, sign),
-        table=_table(ranges.names, units, factors, best, low, high),
+        table=_table(ranges, units, factors, best, problem.free, idle),
         confirm=_confirm(ranges.names, units, factors, found, plain or best, low, high, runs),
         others=tuple(found[1:]),
         notes=tuple(notes),
@@ -260,6 +274,17 @@ def _searched(ranges: Ranges, low: Floats, high: Floats) -> str:
     return (
         f"free, loads too: {', '.join(free)}{held}; a load that is not yours to choose is held with --known {first}=.."
     )
+
+
+def _idle(problem: Problem, box: Sampled, best: LocalAnswer) -> NDArray[np.bool_]:
+    """(parameter,): free ones along which, from the answer, hardly anything changes over the whole range."""
+    over_box = np.ptp(box.values, axis=0)
+    out = np.zeros(len(best.parameters), bool)
+    for k in np.flatnonzero(problem.free):
+        points = np.repeat(best.parameters[None], _ALONG, axis=0)
+        points[:, k] = np.linspace(problem.low[k], problem.high[k], _ALONG)
+        out[k] = bool((np.ptp(problem.values(points), axis=0) <= _MATTERS * over_box).all())
+    return out
 
 
 def _all_known(asked: Sequence[Formula], formulas: Mapping[str, Formula], parameters: Sequence[str]) -> None:
@@ -318,9 +343,11 @@ def _limits(
                 "price": prices[k], "unit": bound.unit,
             }
         )  # fmt: skip
-    return pd.DataFrame(
+    out = pd.DataFrame(
         rows, columns=["limit", "predicted", "margin", "bound", "slack", "active", "probability", "price", "unit"]
     )
+    out.attrs["written"] = [bound.written for bound in bounds]
+    return out
 
 
 def _prices(problem: Problem, best: LocalAnswer, active: NDArray[np.bool_], scale: Floats) -> Floats:
@@ -343,19 +370,23 @@ def _prices(problem: Problem, best: LocalAnswer, active: NDArray[np.bool_], scal
 
 
 def _table(
-    names: Sequence[str], units: Sequence[str], factors: Floats, best: LocalAnswer, low: Floats, high: Floats
+    ranges: Ranges,
+    units: Sequence[str],
+    factors: Floats,
+    best: LocalAnswer,
+    free: NDArray[np.bool_],
+    idle: NDArray[np.bool_],
 ) -> pd.DataFrame:
     import pandas as pd
 
-    edge = np.where(
-        low == high, "given",
-        np.where(best.parameters <= low + 1e-3 * (high - low), "lower edge",
-                 np.where(best.parameters >= high - 1e-3 * (high - low), "upper edge", "")),
-    )  # fmt: skip
+    low, high, at = ranges.low, ranges.high, best.parameters
+    close = 1e-3 * (high - low)
+    given = np.where((at < low - close) | (at > high + close), "given, outside the range", "given")
+    edge = np.where(at <= low + close, "lower edge", np.where(at >= high - close, "upper edge", ""))
     return pd.DataFrame(
         {
-            "parameter": list(names), "value": best.parameters / factors, "unit": list(units),
-            "range_low": low / factors, "range_high": high / factors, "at": edge,
+            "parameter": list(ranges.names), "value": at / factors, "unit": list(units), "range_low": low / factors,
+            "range_high": high / factors, "at": np.where(~free, given, np.where(idle, "hardly matters", edge)),
         }
     )  # fmt: skip
 

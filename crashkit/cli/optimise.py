@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from crashkit.cli._console import print_json, say, table, what_next
 from crashkit.cli._progress import Progress
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def command(
@@ -60,6 +63,7 @@ def command(
             {
                 "output": output, "feasible": found.feasible, "parameters": found.parameters, "objective": found.objective,
                 "value": found.value, "unit": found.unit, "limits": found.limits.to_dict("records"),
+                "table": found.table.to_dict("records"),
                 "sensitivities": found.sensitivities.to_dict("records"), "confirm": found.confirm.to_dict("records"),
                 "notes": found.notes,
             }
@@ -67,8 +71,9 @@ def command(
         return
     for sentence in found.notes:
         say(f"note: {sentence}")
+    limits = _as_written(found.limits)
     if not found.feasible:
-        short = found.limits[found.limits["slack"] < 0]
+        short = limits[limits["slack"] < 0]
         told = "; ".join(f"{r['limit']}: short by {-r['slack']:.4g} {r['unit']}".rstrip() for _, r in short.iterrows())
         say(f"warning: nothing in the trained range keeps all limits; these parameters break them least ({told})")
     unit = "" if found.unit == "1" else f" {found.unit}"
@@ -83,7 +88,7 @@ def command(
             for _, r in found.table.iterrows()
         ),
     )  # fmt: skip
-    if len(found.limits):
+    if len(limits):
         table(
             f"Limits, tightened so that each is kept in {100 * confidence:g} % of cases",
             ("limit", "predicted", "margin", "left", "active", "kept (%)", "price"),
@@ -92,12 +97,23 @@ def command(
                     r["limit"], *(f"{r[name]:{digits}} {r['unit']}".removesuffix(" 1").rstrip() for name, digits in _LENGTHS),
                     "yes" if r["active"] else "", f"{100 * r['probability']:.0f}", _price(r["price"], found.unit, r["unit"]),
                 )
-                for _, r in found.limits.iterrows()
+                for _, r in limits.iterrows()
             ),
         )  # fmt: skip
     what_next(
         output / "confirm.csv", ("predict", model, "--params", output / "confirm.csv", "-o", output / "predicted")
     )
+
+
+def _as_written(limits: pd.DataFrame) -> pd.DataFrame:
+    """The limits in the units in which they were written: 80 mm beside 72 mm."""
+    out = limits.copy()
+    for k, (unit, factor) in enumerate(limits.attrs["written"]):
+        if unit:
+            out.loc[k, ["predicted", "margin", "bound", "slack"]] /= factor
+            out.loc[k, "price"] *= factor
+            out.loc[k, "unit"] = unit
+    return out
 
 
 # Columns in the unit of the limit, and their digits.

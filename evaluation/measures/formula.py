@@ -166,6 +166,8 @@ class Limit:
         The right side, in SI units; the unit is empty where none was written.
     text
         As it was written.
+    written
+        The unit as it was written, and its value in SI.
     """
 
     formula: Formula
@@ -173,6 +175,7 @@ class Limit:
     bound: float
     unit: str
     text: str
+    written: tuple[str, float] = ("", 1.0)
 
     def kept(self, value: Value) -> NDArray[np.bool_]:
         """(run, *axes): whether it is kept; False where the value is not a number.
@@ -263,7 +266,7 @@ def read_limit(text: str, formulas: Mapping[str, Formula] | None = None) -> Limi
     found = re.fullmatch(r"(.+?)\s*(<=|>=|<|>)\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*)?", text.strip())
     if found is None or any(sign in found[1] for sign in "<>"):
         raise EvaluationError(f"{text!r} is no limit; expected a number, a sign and a bound, such as intrusion < 80 mm")
-    bound, unit = float(found[3]), ""
+    bound, unit, factor = float(found[3]), "", 1.0
     if found[4]:
         try:
             factor, unit = to_si(found[4].strip())
@@ -271,7 +274,9 @@ def read_limit(text: str, formulas: Mapping[str, Formula] | None = None) -> Limi
             raise EvaluationError(f"{text!r}: the unit {found[4]!r} is not known ({error})") from error
         bound *= factor
     known = (formulas or {}).get(found[1].strip())
-    return Limit(known or read_formula(found[1]), found[2], bound, unit, text.strip())
+    return Limit(
+        known or read_formula(found[1]), found[2], bound, unit, text.strip(), ((found[4] or "").strip(), factor)
+    )
 
 
 def part_nodes(parts: Mapping[str, NDArray[np.int64]], wanted: str) -> NDArray[np.int64]:

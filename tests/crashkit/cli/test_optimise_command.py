@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pandas as pd
@@ -67,7 +68,7 @@ def test_where_nothing_is_feasible_the_least_broken_is_named(model: Path, tmp_pa
     )  # fmt: skip
     assert code == 0
     assert "nothing in the trained range keeps all limits" in err
-    assert "short by 0.1" in err
+    assert re.search(r"short by 1\d\d(\.\d+)? mm", err), "in the unit of the limit"
     assert "lower edge" in out
 
 
@@ -99,7 +100,24 @@ def test_free_parameters_are_named_first_and_limits_carry_units(model: Path, tmp
     assert "given: yield_stress = 4e+08 Pa" in said
     assert "held with --known impact_speed=" in said
     found = pd.read_csv(tmp_path / "best" / "limits.csv")
-    assert f"{found['predicted'][0]:.4g} m" in out
+    assert f"{1000 * found['predicted'][0]:.4g} mm" in out, "in the unit of the limit"
+    assert found["predicted"][0] < 0.3, "the file is in SI"
+
+
+def test_parameters_without_influence_are_told_and_given_ones_have_their_trained_range(
+    model: Path, tmp_path: Path
+) -> None:
+    code, _, err = run(
+        "optimise", model, "--minimise", "2 * impact_speed", "--known", "yield_stress=400MPa", "-o", tmp_path / "best",
+        "--starts", 1,
+    )  # fmt: skip
+    assert code == 0, err
+    assert "note: impact_angle hardly matters there: over the whole range the value change" in " ".join(err.split())
+    found = pd.read_csv(tmp_path / "best" / "parameters.csv", index_col="parameter")
+    assert list(found["at"]) == ["lower edge", "hardly matters", "given"]
+    low, high = (float(f(dataset(20)["yield_stress"])) for f in (min, max))
+    assert found.loc["yield_stress", ["range_low", "range_high"]].tolist() == pytest.approx([low, high], rel=1e-6)
+    assert found.loc["yield_stress", "value"] == pytest.approx(4e8)
 
 
 def test_a_number_with_the_name_of_a_parameter_is_refused(model: Path) -> None:
