@@ -8,6 +8,7 @@ friends only inside functions, so that `crashkit --help` stays quick.
 from __future__ import annotations
 
 import functools
+import gc
 import importlib
 from collections.abc import Callable
 from typing import Any
@@ -97,4 +98,8 @@ def _root(
 
 def main() -> None:
     """Entry point of the console script."""
-    app()
+    try:
+        app()
+    finally:
+        # Else the interpreter searches all that is left for cycles as it goes down: a quarter of the time of `info`.
+        gc.freeze()
