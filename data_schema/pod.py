@@ -171,6 +171,7 @@ def pod(runs: Iterable[NDArray[np.floating]], count: int, keep: int | None = Non
     stream = StreamedPod(count, keep)
     for run in runs:
         stream.add(run)
+        del run  # else it is there while the next one is read
     return stream.result()
 
 

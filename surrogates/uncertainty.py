@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -186,13 +186,22 @@ def gather(distances: Iterable[NDArray[np.float32]]) -> Gathered:
     """Means (run, node) and (run, state), and the distances (state, some nodes) of each run; NaN where a node is gone."""
     by_node, by_state, pooled = [], [], []
     for distance in distances:
-        by_node.append(np.nanmean(distance, axis=0, dtype=np.float64))
-        by_state.append(np.nanmean(distance, axis=1, dtype=np.float64))
+        by_node.append(living_mean(distance, 0, np.float64))
+        by_state.append(living_mean(distance, 1, np.float64))
         some = np.unique(np.linspace(0, distance.shape[1] - 1, _POOLED).astype(int))
         pooled.append(distance[:, some])
     if not pooled:
         return np.zeros((0, 1)), np.zeros((0, 1)), []
     return np.stack(by_node), np.stack(by_state), pooled
+
+
+def living_mean(
+    distance: NDArray[np.float32], axis: int, dtype: type[np.floating[Any]] | None = None
+) -> NDArray[np.floating[Any]]:
+    """The mean over what is there; where that is everything, without the copy that `nanmean` makes."""
+    if np.isnan(distance.sum()):
+        return np.asarray(np.nanmean(distance, axis=axis, dtype=dtype))
+    return np.asarray(distance.mean(axis=axis, dtype=dtype))
 
 
 def _product(
@@ -204,11 +213,11 @@ def _product(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Factors of node and state, and the quantiles of the ratios to them; each run is judged by the others."""
     some = np.unique(np.linspace(0, by_node.shape[1] - 1, _POOLED).astype(int))
-    ratios = []
+    of_some, ratios = by_node[:, some], []
     for k, distance in enumerate(pooled):
         others = which != which[k]
-        node, state = _scale(by_node[others], by_state[others])
-        ratio = (distance / (share[k] * state[:, None] * node[some])).ravel()
+        node, state = _scale(of_some[others], by_state[others])
+        ratio = (distance / (share[k] * state[:, None] * node)).ravel()
         ratios.append(ratio[np.isfinite(ratio)])
     factor = np.quantile(np.concatenate(ratios), SHARES)
     return (*_scale(by_node, by_state), factor)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from crashkit.display import watched
+from data_schema.memory import give_back
 from data_schema.progress import Progress
 
 if TYPE_CHECKING:
@@ -144,6 +145,7 @@ def train(
     odd = chosen.physics.odd or ()
     source = source_of(dataset, hierarchy)
     campaign = open_campaign(source, test, symmetry=symmetry, odd=odd)
+    give_back()  # the search for mirror planes leaves much free between what stays
     if coarse is not None:
         from crashkit.api.coarse_runs import coarse_runs
 

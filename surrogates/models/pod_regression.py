@@ -41,6 +41,8 @@ _WITH_TRANSLATIONS = 8
 _TRANSLATIONS = 3
 # Another view or number of modes is chosen if it lowers the error by this share.
 _MARGIN = 0.001
+# Nodes whose distances are worked out at once.
+_NODES = 1 << 13
 
 
 @dataclass
@@ -219,11 +221,30 @@ class PodFit:
 
 @dataclass(frozen=True)
 class Held:
-    """One training run as the others predict it: its place, displacements (state, node, 3), m, and the belief's deviation."""
+    """One training run as the others predict it: its place, coefficients, and the belief's deviation.
+
+    course (state, mode), m, of modes (3 * node, mode)
+    """
 
     run: int
-    predicted: NDArray[np.float32]
+    course: NDArray[np.float32]
+    modes: NDArray[np.float32]
     deviation: float
+
+    @property
+    def predicted(self) -> NDArray[np.float32]:
+        """(state, node, 3), m"""
+        return np.asarray((self.course @ self.modes.T).reshape(len(self.course), -1, 3), np.float32)
+
+    def off(self, truth: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(state, node), m: how far it is from the run's own displacements (state, node, 3); some nodes at a time."""
+        out = np.empty(truth.shape[:2], np.float32)
+        for first in range(0, truth.shape[1], _NODES):
+            nodes, rows = slice(first, first + _NODES), slice(3 * first, 3 * (first + _NODES))
+            some = (self.course @ self.modes[rows].T).reshape(len(truth), -1, 3)
+            some -= truth[:, nodes]
+            out[:, nodes] = np.sqrt(np.einsum("snx,snx->sn", some, some))
+        return out
 
 
 def fit_pod_regression(
@@ -300,7 +321,7 @@ def _held_over(found: CoarseFit, modes: NDArray[np.float32], *, itself: bool) ->
     for run, far, near, deviation in found.held:
         course = near if itself else far
         if course is not None:
-            yield Held(run, (course @ modes.T).reshape(len(course), -1, 3), deviation)
+            yield Held(run, np.asarray(course, np.float32), modes, deviation)
 
 
 def _chosen(
@@ -442,12 +463,14 @@ def _rotation(values: NDArray[np.float32]) -> Callable[[int], NDArray[np.float32
 
 
 def _held(candidate: _Candidate, trials: Trials, settings: Settings, count: int) -> Iterator[Held]:
+    """Every left-out run; one that several folds leave out comes several times in a row."""
+    out = []
     with one_thread():
-        folds = list(_fold_courses(candidate, trials, settings))
-    for part, held, course, deviations in folds:
-        turn = _rotation(part)(count)
-        for run, states, deviation in zip(held, (course @ turn) @ turn.T, deviations, strict=True):
-            yield Held(int(run), (states @ trials.courses.modes.T).reshape(len(states), -1, 3), float(deviation))
+        for part, held, course, deviations in _fold_courses(candidate, trials, settings):
+            turn = _rotation(part)(count)
+            for run, states, deviation in zip(held, (course @ turn) @ turn.T, deviations, strict=True):
+                out.append(Held(int(run), states, trials.courses.modes, float(deviation)))
+    yield from sorted(out, key=lambda held: held.run)
 
 
 def _points(data: Coefficients) -> NDArray[np.float64]:

@@ -153,12 +153,13 @@ class Courses:
         for k, run in enumerate(chosen):
             _log.info("coefficients of run %d of %d", k + 1, len(chosen))
             values = runs.read(run)
-            truth[k] = values[states][:, judged]
+            truth[k] = values[states[:, None], judged]
             known = runs.there(run)
             if known is not None:
                 there[k] = known[states][:, judged]
             for plane, part in enumerate(fields.of(values)):
                 (own if plane == 0 else images[plane - 1])[k] = part.reshape(len(part), -1) @ basis
+            del values, part  # else they are there while the next run is read
         nodes = judged if some is None else np.searchsorted(some, judged)
         return cls(
             basis, campaign.time.astype(np.float64), own, images, nodes, states, truth, None if there.all() else there
@@ -387,7 +388,9 @@ def _basis(fields: _Fields, chosen: NDArray[np.int64], count: int) -> NDArray[np
             values = fields.runs.read(run)
             values = values[np.unique(np.linspace(0, len(values) - 1, _BASIS_STATES).astype(int))]
             for part in fields.of(values):
-                yield part - part.mean(axis=1, keepdims=True)
+                part -= part.mean(axis=1, keepdims=True)  # in place: images lose their translation anyway
+                yield part
+            del values, part  # else they are there while the next run is read
 
     found = pod(states(), count, keep=count + _KEPT_BESIDE)
     good = found.singular_values > _SMALLEST * found.singular_values[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import itertools
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -34,7 +35,15 @@ from surrogates.training.loop import Diverged, Epoch, Keeper, device_of
 from surrogates.training.members import averaged, fits_together, trainer_of
 from surrogates.training.refinement import Refined
 from surrogates.training.trainer import Trainer
-from surrogates.uncertainty import FEWEST_BY_FOLDS, FEWEST_RUNS, Band, Beliefs, calibrate_gathered, gather
+from surrogates.uncertainty import (
+    FEWEST_BY_FOLDS,
+    FEWEST_RUNS,
+    Band,
+    Beliefs,
+    calibrate_gathered,
+    gather,
+    living_mean,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -230,12 +239,11 @@ def _judge_by_folds(surrogate: Surrogate, trainer: Trainer, found: PodFit, watch
     errors: list[float] = []
 
     def distances() -> Iterator[NDArray[np.float32]]:
-        for held in found.held():
+        for held, distance in _off_held(found.held(), field, runs):
             places.append(held.run)
             deviations.append(held.deviation)
             if watch is not None:
                 watch(surrogate, int(runs[held.run]), held.predicted)
-            distance = _off(held.predicted, field, runs[held.run])
             errors.append(_mean(distance))
             yield distance
 
@@ -273,10 +281,10 @@ def _band_from_runs(
     deviations: list[float] = []
 
     def distances() -> Iterator[NDArray[np.float32]]:
-        for one in held:
+        for one, distance in _off_held(held, field, runs):
             places.append(one.run)
             deviations.append(one.deviation)
-            yield _off(one.predicted, field, runs[one.run])
+            yield distance
 
     gathered = gather(distances())
     if len(set(places)) < FEWEST_BY_FOLDS:
@@ -572,6 +580,21 @@ def _off(
     return out if there is None else np.where(there, out, np.float32(np.nan))
 
 
+def _off_held(
+    left_out: Iterable[Held], field: LevelRuns, runs: NDArray[np.int64]
+) -> Iterator[tuple[Held, NDArray[np.float32]]]:
+    """Left-out runs, and (state, node), m, how far each is from its truth, as `_off` says it.
+
+    A run that comes several times in a row is read once.
+    """
+    for place, same in itertools.groupby(left_out, key=lambda held: held.run):
+        truth, there = field.read(runs[place]), field.there(runs[place])
+        for held in same:
+            distance = held.off(truth)
+            yield held, distance if there is None else np.where(there, distance, np.float32(np.nan))
+        del truth  # else it is there while the next one is read
+
+
 def _mean(distance: NDArray[np.float32]) -> float:
     """e2, m: the mean over living nodes, then over states."""
-    return float(np.nanmean(distance, axis=1).mean())
+    return float(living_mean(distance, 1).mean())

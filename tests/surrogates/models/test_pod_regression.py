@@ -9,7 +9,7 @@ from scipy.interpolate import RBFInterpolator
 
 from surrogates.data.campaign import Campaign
 from surrogates.errors import SurrogateError
-from surrogates.models.pod_regression import PodRegression
+from surrogates.models.pod_regression import Held, PodRegression
 from surrogates.regression.gaussian import RadialBasis
 from surrogates.settings import settings
 from surrogates.training.train import train_surrogate
@@ -110,3 +110,30 @@ def still(runs: int) -> Campaign:
 def test_a_campaign_in_which_nothing_moves_is_refused() -> None:
     with pytest.raises(SurrogateError, match="no training run moves"):
         train_surrogate(still(6), settings("pod-gpr"))
+
+
+def test_each_run_is_read_for_the_basis_for_its_coefficients_and_once_to_judge_it() -> None:
+    class Counted:
+        def __init__(self, field: np.ndarray) -> None:
+            self.field, self.shape, self.reads = field, field.shape, np.zeros(len(field), int)
+
+        def __getitem__(self, run: int) -> np.ndarray:
+            self.reads[run] += 1
+            return self.field[run]
+
+    runs = 14  # each fold is drawn twice, so every run is left out twice
+    field = Counted(plate.displacement(plate.parameters(runs)))
+    found = train_surrogate(
+        plate.campaign(runs, displacement=lambda level: field), settings("pod-gpr", overrides=["pod.modes=[4]"])
+    )
+    assert found.bands
+    assert field.reads.tolist() == [3] * runs
+
+
+def test_distances_of_a_left_out_run_are_those_of_its_whole_prediction(monkeypatch: pytest.MonkeyPatch) -> None:
+    draw = np.random.default_rng(0)
+    course, modes = draw.normal(size=(7, 4)).astype("f4"), draw.normal(size=(3 * 50, 4)).astype("f4")
+    truth = draw.normal(size=(7, 50, 3)).astype("f4")
+    held = Held(0, course, modes, 1.0)
+    monkeypatch.setattr("surrogates.models.pod_regression._NODES", 16)
+    np.testing.assert_allclose(held.off(truth), np.linalg.norm(held.predicted - truth, axis=-1), rtol=1e-5)
