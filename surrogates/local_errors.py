@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
 
 # Any query is near to one average run: far from all others the ratio goes to the mean.
 # A run, or the surroundings of a query, is said to be hard from this many times the typical error on.
@@ -65,7 +64,7 @@ class LocalErrors:
         ratio = errors / scale if scale > 0 else np.ones(len(errors))
         if images is not None:
             points, ratio, run = np.concatenate([points, images]), np.tile(ratio, 2), np.tile(run, 2)
-        apart = cdist(points, points)
+        apart = _distances(points, points)
         apart[run[:, None] == run] = np.inf
         nearest = apart.min(axis=1)
         known = nearest[np.isfinite(nearest)]
@@ -77,7 +76,7 @@ class LocalErrors:
 
         run  (query,) the run each point is of: it and its image say nothing of themselves
         """
-        weight = np.exp(-0.5 * np.square(cdist(points, self.points) / self.width))
+        weight = np.exp(-0.5 * np.square(_distances(points, self.points) / self.width))
         if run is not None:
             weight[run[:, None] == self.run] = 0.0
         return np.asarray((weight @ self.ratio + self.prior) / (weight.sum(axis=1) + 1))
@@ -89,7 +88,15 @@ class LocalErrors:
 
     def hard_runs(self, point: NDArray[np.float64]) -> NDArray[np.int64]:
         """Numbers of the runs near a point (parameter,) that were predicted far worse than expected, the worst first."""
-        near = cdist(point[None], self.points)[0] <= REACH * self.width
+        near = _distances(point[None], self.points)[0] <= REACH * self.width
         places = np.flatnonzero(near & (self.ratio > HARD))
         found = self.run[places[np.argsort(-self.ratio[places], kind="stable")]]
         return found[np.sort(np.unique(found, return_index=True)[1])]
+
+
+def _distances(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(i, j) between points (i, parameter) and (j, parameter); scipy's takes half a second to import."""
+    out = np.zeros((len(a), len(b)))
+    for k in range(a.shape[1]):
+        out += np.square(a[:, k, None] - b[None, :, k])
+    return np.sqrt(out, out=out)

@@ -123,10 +123,10 @@ class Model:
             For a level the model does not have; with `band`, where too few runs were left out.
         """
         import numpy as np
-        import xarray as xr
 
         from crashkit.api.parameters import parameter_table
         from crashkit.errors import DataError
+        from data_schema.finite import all_finite
 
         surrogate, ranges = self.surrogate, self.record.ranges
         values, several = parameter_table(parameters, ranges)
@@ -147,7 +147,7 @@ class Model:
                 ]
             else:
                 u = surrogate.predict_full(values, at, number) if full else surrogate.predict(values, at, number)
-        if not np.isfinite(u).all():
+        if not all_finite(u):
             raise DataError(
                 "the model gives numbers that are not finite for these parameters; check the values, or train it again"
             )
@@ -168,7 +168,7 @@ class Model:
                 slope = surrogate.lift(slope, number) if full else slope
                 arrays[f"displacement_by_{name}"] = (slope[None], f"m ({unit})-1")
         on_elements = self._on_elements(values, at, 0 if full else number)
-        out = xr.Dataset(
+        out = _labelled(
             {
                 **on_elements,
                 **{
@@ -362,6 +362,8 @@ class Model:
 
     def _numbers(self, values: NDArray[np.float64], band: float | None, level: int) -> dict[str, Any]:
         """Numbers by formula of the settings, as variables of a dataset."""
+        if not self.record.numbers:
+            return {}
         from crashkit.api.numbers import predicted_numbers
 
         out: dict[str, Any] = {}
@@ -428,6 +430,28 @@ class Model:
         from crashkit.display import as_html
 
         return as_html(*self._facts())
+
+
+def _labelled(
+    arrays: Mapping[str, tuple[Any, ...]], coords: Mapping[str, tuple[Any, ...]], attrs: Mapping[str, Any]
+) -> xr.Dataset:
+    """What `xarray.Dataset(arrays, coords, attrs)` is, of arrays (dimensions, values, attributes) and coordinates of one dimension.
+
+    That imports Dask and Pint where they are installed, to ask whether arrays are theirs, which takes a second.
+    """
+    import numpy as np
+    import pandas as pd
+    import xarray as xr
+
+    def variable(dims: str | tuple[str, ...], values: Any, attributes: Mapping[str, Any] | None = None) -> xr.Variable:
+        return xr.Variable((dims,) if isinstance(dims, str) else dims, np.asarray(values), attributes, fastpath=True)
+
+    indexes = {name: xr.indexes.PandasIndex(pd.Index(told[1], name=name), name) for name, told in coords.items()}
+    labels: dict[Any, Any] = {}
+    for name, told in coords.items():
+        labels |= indexes[name].create_variables({name: variable(*told)})
+    variables = {name: variable(*told) for name, told in arrays.items()}
+    return xr.Dataset(variables, coords=xr.Coordinates(labels, indexes=indexes), attrs=attrs)
 
 
 def _centimetres(error: float | None) -> str:

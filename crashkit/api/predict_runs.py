@@ -458,7 +458,7 @@ def _predicted(
         level=int(prediction.attrs["level"]),
         states=prediction.sizes["time"],
         nodes=prediction.sizes["node"],
-        largest_displacement_m=float(np.linalg.norm(moved, axis=-1).max()),
+        largest_displacement_m=max(float(np.einsum("nx,nx->n", u, u).max()) for u in moved) ** 0.5,
         warnings=sentences,
         expected_removed=None if last is None else float(last.sum()),
         hidden=None if last is None else int((last > hide_above).sum()),

@@ -20,6 +20,9 @@ T = TypeVar("T")
 def read_reference(name: str, dataset: xr.Dataset, levels: Sequence[Level] = ()) -> Reference:
     """The runs of a dataset; whatever is read of one later raises ReadError where it is damaged or missing.
 
+    The displacements asked for last are kept until those of another run are: who asks for a run several times in a row
+    reads it once. They must not be changed.
+
     Parameters
     ----------
     name
@@ -27,10 +30,9 @@ def read_reference(name: str, dataset: xr.Dataset, levels: Sequence[Level] = ())
     levels
         Those of its mesh hierarchy.
     """
-    import numpy as np
-
     from crashkit.dataset import reading_dataset
     from crashkit.errors import ReadError
+    from data_schema.finite import all_finite
     from evaluation.comparison.reference import reference_of
 
     def guarded(read: Callable[[int], T]) -> Callable[[int], T]:
@@ -40,9 +42,18 @@ def read_reference(name: str, dataset: xr.Dataset, levels: Sequence[Level] = ())
 
         return from_file
 
+    recent: dict[int, NDArray[np.floating]] = {}
+
     def displacement(run: int) -> NDArray[np.floating]:
-        u = found.displacement(run)
-        if not erodes and not np.isfinite(u).all():
+        if run not in recent:
+            recent.clear()  # before the next one is read
+            recent[run] = checked(run)
+        return recent[run]
+
+    def checked(run: int) -> NDArray[np.floating]:
+        u = found.displacement(run).view()
+        u.flags.writeable = False
+        if not erodes and not all_finite(u):
             raise ReadError(
                 f"{name}: displacements of run {found.runs[run]} are missing though nothing erodes; expected "
                 f"numbers everywhere: see crashkit validate, and ingest the run again"

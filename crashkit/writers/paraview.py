@@ -38,6 +38,8 @@ _Steps = Iterator[tuple["State", NDArray[Any]]]
 
 # zlib level 1: levels above cost time and win next to nothing on floating point numbers.
 _COMPRESSION = 1
+# The same in HDF5, with bytes of one significance side by side: two thirds of the time, four fifths of the size.
+_PACKED: dict[str, Any] = {"compression": "gzip", "compression_opts": _COMPRESSION, "shuffle": True}
 _VTK_LINE, _VTK_TRIANGLE, _VTK_QUAD = 3, 5, 9
 _COMPONENTS = 9  # of a full tensor, the widest array there is
 _HIDDEN_CELL = 32  # vtkDataSetAttributes::HIDDENCELL
@@ -703,7 +705,7 @@ class _Disk(FileIO):
 
 def _dataset(group: h5py.Group, name: str, values: NDArray[Any], unit: str | None = None) -> h5py.Dataset:
     """`values`, compressed where that pays."""
-    options = {"compression": "gzip", "compression_opts": _COMPRESSION} if values.nbytes > 4096 else {}
+    options = _PACKED if values.nbytes > 4096 else {}
     dataset = group.create_dataset(name, data=values, **options)
     if unit is not None:
         dataset.attrs["units"] = unit
@@ -717,7 +719,7 @@ def _grown(group: h5py.Group, name: str, like: NDArray[Any], states: int, unit: 
     if like.size:
         # HDF5 refuses chunks of 4 GiB and above; a large state is cut into pieces.
         rows = max(1, min(len(like), (1 << 26) // max(1, like[:1].nbytes)))
-        options = {"chunks": (rows, *like.shape[1:]), "compression": "gzip", "compression_opts": _COMPRESSION}
+        options = {"chunks": (rows, *like.shape[1:]), **_PACKED}
     dataset = group.create_dataset(name, shape, like.dtype, **options)
     if unit is not None:
         dataset.attrs["units"] = unit

@@ -36,7 +36,7 @@ class ValueRanges:
                     self._note(kind, name, values)
 
     def _note(self, kind: str, name: str, values: NDArray[Any]) -> None:
-        sizes = values if values.ndim == 1 else np.linalg.norm(values, axis=1)
+        sizes = values if values.ndim == 1 else np.sqrt(np.einsum("nx,nx->n", values, values))
         there = sizes[np.isfinite(sizes)]
         if not len(there):
             return

@@ -162,6 +162,18 @@ def test_states_are_encoded_with_their_labels(model: crashkit.Model, runs: xr.Da
     assert latent.sizes["latent"] == model.surrogate.n_latent(level)
 
 
+def test_a_prediction_is_the_dataset_that_xarray_makes_of_its_arrays(model: crashkit.Model) -> None:
+    said = model.predict({**ASKED, "impact_speed": [20.0, 22.0]})
+    again = xr.Dataset(
+        {n: (v.dims, v.values, v.attrs) for n, v in said.data_vars.items()},
+        {n: (v.dims, v.values, v.attrs) for n, v in said.coords.items()},
+        said.attrs,
+    )
+    xr.testing.assert_identical(said, again)
+    assert {n: type(index) for n, index in said.xindexes.items()} == {n: type(i) for n, i in again.xindexes.items()}
+    assert said.sel(time=0.014, node=said["node"].values[3], sim="prediction_1")["displacement"].shape == (3,)
+
+
 def test_a_model_is_stored_later(model: crashkit.Model, tmp_path: Path) -> None:
     alone = crashkit.Model(model.surrogate)
     alone.save(tmp_path / "later")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +32,20 @@ def test_files_hold_the_prediction(model: Path, name: str, options: dict, tmp_pa
     back = next(iter(reader_for(tmp_path / name).runs(tmp_path / name, **options)))
     said = crashkit.load_model(model).predict({"impact_speed": 20, "impact_angle": 5, "yield_stress": 4e8})
     assert np.abs(back.displacement(0, 7) - said["displacement"].values).max() < 1e-6
+
+
+def test_a_run_is_predicted_and_written_without_the_libraries_that_only_other_work_needs(
+    model: Path, tmp_path: Path
+) -> None:
+    arguments = ["crashkit", "predict", str(model), *ASKED, "-o", str(tmp_path / "run.vtkhdf"), "--json"]
+    unneeded = ("dask.base", "pint", "torch", "sklearn", "numba", "vtkmodules", "matplotlib")
+    code = (
+        f"import sys, crashkit.cli as c; sys.argv = {arguments!r}; c.app(standalone_mode=False); "
+        f"print([m for m in {unneeded!r} if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+    assert (tmp_path / "run.vtkhdf").exists()
 
 
 def test_rows_of_a_table_in_parallel_are_those_one_by_one(model: Path, tmp_path: Path) -> None:
