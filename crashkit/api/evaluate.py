@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
+    from crashkit.api._predicted import FormulaMesh
     from crashkit.api.model import Model as Trained
     from crashkit.api.source import Source
     from crashkit.mesh.levels import Hierarchy
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from evaluation.comparison.result import Evaluation
     from evaluation.comparison.scoring import RunScores
     from evaluation.comparison.sensors import Sensors
+    from evaluation.measures.formula import Formula
     from surrogates.surrogate import Surrogate
 
     GivenModel = Trained | Surrogate | str | Path
@@ -112,6 +114,7 @@ def evaluate(
     from evaluation.comparison.split import agree_on_split, entries
     from evaluation.errors import EvaluationError
     from evaluation.figures import kinds
+    from evaluation.figures.folds import pair
     from evaluation.report.files import default_runs, write_run
     from evaluation.report.report import write_report
 
@@ -130,9 +133,17 @@ def evaluate(
     entries(stored, seeds_as_spread)  # refuses what cannot be compared before anything is computed
     shown_runs = None if vtk_runs is None else _places(reference, vtk_runs)
     sensors = choose_sensors(reference, probes, intrusion)
+    found = pair(reference, stored)
+    two_ways = () if found is None else found[1:]
     with _folder(output) as folder:
         with _counted(tell, "modes of the training runs", len(split.train)) as step:
-            pods = decompose(reference, split.train, done=lambda _: step())
+            last: dict[int, NDArray[np.floating]] = {}
+
+            def keep(run: int, truth: NDArray[np.floating]) -> None:
+                if run in two_ways:
+                    last[run] = truth[-1].copy()
+
+            pods = decompose(reference, split.train, done=lambda _: step(), watch=keep)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".modes-") as kept:
             scorer = Scorer(source, asked, _keep_modes(pods, Path(kept)), sensors, opened=(reference, stored))
             scored: dict[int, RunScores] = {}
@@ -148,7 +159,7 @@ def evaluate(
             reference, stored, split, seeds_as_spread=seeds_as_spread, pods=pods, scored=[scored[k] for k in sorted(scored)],
             sensors=sensors, context=_context(Path(source.name), reference, stored, split),
         )  # fmt: skip
-        result = dataclasses.replace(result, beside=_beside(source, result, tell))
+        result = dataclasses.replace(result, beside=_beside(source, result, tell), last_states=last)
         if formats:
             runs = default_runs(result) if shown_runs is None else shown_runs
             with _counted(tell, "runs for ParaView", len(runs)) as step:
@@ -213,27 +224,29 @@ def _beside(source: Source, result: Evaluation, tell: Progress) -> Beside | None
     true_curves = {name: (unit, values[test]) for name, unit, values in channels}
     parameters = {label: reference.parameters[test][:, list(one.order)] for label, one in asked.items()}
     numbers: dict[tuple[str, str, str], tuple[Any, dict[str, Any], dict[str, float]]] = {}
+    to_measure: dict[tuple[str, str, str], tuple[str, FormulaMesh, Mapping[str, Formula], Formula]] = {}
     for label, one in asked.items():
         formulas, structure = model_formulas(one.surrogate), FormulaMesh.of(one.surrogate)
         said = [predicted_numbers(one.surrogate, p[None]) for p in parameters[label]]
         for k, (name, formula) in enumerate(formulas.items()):
             key = (name, formula.text, said[0][k].unit)
             if key not in numbers:
-                truth = np.full(len(test), np.nan)
-                for place, run in enumerate(test):
-                    tell("numbers of the test runs", place + 1, len(test), name)
-                    curves = {
-                        c: Value(values[place : place + 1], ("time",), time, unit or "1")
-                        for c, (unit, values) in true_curves.items()
-                    }
-                    own, states = parameters[label][place : place + 1], reference.displacement(run)[None]
-                    true = GivenRuns(structure, own, reference.time, states, curves)
-                    truth[place] = float(np.asarray(formula.number(true, formulas).array).ravel()[0])
-                numbers[key] = (truth, {}, {})
+                numbers[key] = (np.full(len(test), np.nan), {}, {})
+                to_measure[key] = (label, structure, formulas, formula)
             errors = list(one.surrogate.record.numbers[name]["errors"].values())
             width = half_width(errors, SHARE)
             numbers[key][1][label] = np.array([float(found[k].values[0]) for found in said])
             numbers[key][2][label] = float("nan") if width is None else width
+    for place, run in enumerate(test if to_measure else ()):  # each is read once for all numbers
+        tell("numbers of the test runs", place + 1, len(test), "")
+        curves = {
+            c: Value(values[place : place + 1], ("time",), time, unit or "1")
+            for c, (unit, values) in true_curves.items()
+        }
+        states = reference.displacement(run)[None]
+        for key, (label, structure, others, formula) in to_measure.items():
+            true = GivenRuns(structure, parameters[label][place : place + 1], reference.time, states, curves)
+            numbers[key][0][place] = float(np.asarray(formula.number(true, others).array).ravel()[0])
     curves_compared = []
     for name, (unit, truth) in true_curves.items():
         having = {label: one.surrogate for label, one in asked.items() if name in one.surrogate.curves}

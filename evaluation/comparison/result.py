@@ -56,6 +56,8 @@ class Evaluation(Described):
         ParaView files written of it (evaluation.report.files.write_run).
     beside
         Histories and numbers by formula; None where no model has any.
+    last_states
+        Number of a training run -> its displacements (node, 3), m, at the end, of those that are shown.
     """
 
     reference: Reference
@@ -71,6 +73,7 @@ class Evaluation(Described):
     sensors: Sensors | None = None
     files: tuple[Path, ...] = ()
     beside: Beside | None = None
+    last_states: Mapping[int, NDArray[np.floating]] = field(default_factory=dict)
 
     def _facts(self) -> tuple[str, Facts, Sequence[str], Rows]:
         rows = []
@@ -165,8 +168,11 @@ def decompose(
     runs: Sequence[int],
     count: int = N_MODES,
     done: Callable[[int], None] | None = None,
+    watch: Callable[[int, NDArray[np.floating]], None] | None = None,
 ) -> dict[int, Pod]:
     """POD of `runs` on the full mesh and on every coarse level, reading each run once: level -> Pod.
+
+    watch  shown each run as it passes: its number and (state, node, 3), m
 
     Raises
     ------
@@ -180,6 +186,8 @@ def decompose(
         truth = reference.displacement(run)
         for level, stream in streams.items():
             stream.add(last_seen(truth if level == 0 else truth[:, reference.level(level).kept]))
+        if watch:
+            watch(run, truth)
         if done:
             done(run)
     return {level: moving(stream.result()) for level, stream in streams.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,8 @@ from evaluation.measures.distance import masked_mean
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from evaluation.comparison.predictor import ComparedModel
+    from evaluation.comparison.reference import Reference
     from evaluation.comparison.result import Evaluation
 
 _LISTED = 20
@@ -75,19 +78,32 @@ class Fold:
         )
 
 
-def select(evaluation: Evaluation) -> Fold | None:
-    from evaluation.drawing.rendering import rendering_problem
-
-    model = next((m for m in evaluation.models if m.hard), None)
-    if model is None or len(model.fitted_runs) < 2 or rendering_problem() is not None:
+def pair(reference: Reference, models: Sequence[ComparedModel]) -> tuple[ComparedModel, int, int] | None:
+    """A model, the worst of its runs that neighbours contradict, and the nearest training run; None without any."""
+    model = next((m for m in models if m.hard), None)
+    if model is None or len(model.fitted_runs) < 2:
         return None
-    reference = evaluation.reference
     first = reference.index([next(iter(model.hard))])[0]
     others = [k for k in reference.index(model.fitted_runs) if k != first]
     span = np.ptp(reference.parameters[[first, *others]], axis=0)
     moves = span > 0
     away = (reference.parameters[others] - reference.parameters[first])[:, moves] / span[moves]
-    second = others[int(np.square(away).sum(axis=1).argmin())]
+    return model, first, others[int(np.square(away).sum(axis=1).argmin())]
+
+
+def select(evaluation: Evaluation) -> Fold | None:
+    from evaluation.drawing.rendering import rendering_problem
+
+    reference = evaluation.reference
+    found = pair(reference, evaluation.models)
+    if found is None or rendering_problem() is not None:
+        return None
+    model, first, second = found
+
+    def at_the_end(run: int) -> NDArray[np.floating]:
+        seen = evaluation.last_states.get(run)
+        return reference.displacement(run)[-1] if seen is None else seen
+
     return Fold(
         model.name,
         (reference.runs[first], reference.runs[second]),
@@ -96,8 +112,8 @@ def select(evaluation: Evaluation) -> Fold | None:
         reference.position_of(first),
         reference.faces,
         None if reference.alive is None else reference.alive(first)[-1],
-        reference.displacement(first)[-1],
-        reference.displacement(second)[-1],
+        at_the_end(first),
+        at_the_end(second),
         dict(model.hard),
     )
 

@@ -6,12 +6,14 @@ import json
 import runpy
 import shutil
 import sys
+from collections import Counter
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import zarr
+from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
 from crashkit.dataset import demo_data, open_dataset
@@ -305,3 +307,35 @@ def test_a_report_is_replaced_only_when_asked(campaign, small, tmp_path):
     assert result.exit_code == 0, result.output
     lines = [line for line in result.stderr.splitlines() if line.startswith("warning: ")]
     assert any("Few test runs" in line for line in lines)
+
+
+def test_training_runs_are_read_once_and_test_runs_three_times_at_most(campaign, monkeypatch, tmp_path):
+    from crashkit.api.train import train
+
+    settings = {
+        "kpi": {f"most_{axis}": f"max(displacement(along={axis}))" for axis in "xyz"},
+        "physics.clock": "off", "physics.symmetry": "off", "inputs.derived": "off", "pod.modes": [4],
+    }  # fmt: skip
+    train(campaign / "kart.zarr", tmp_path / "gpr", "pod-gpr", settings=settings, test="5:8")
+    # What the page shows of single runs: the worst one, and two training runs that contradict each other.
+    monkeypatch.setattr(
+        "surrogates.surrogate.Surrogate.hard_runs", lambda model: {model.record.fitted_runs[1]: (0.02, 3.0)}
+    )
+    monkeypatch.setattr("evaluation.figures.ORDER", ("worst", "folds"))
+    reads, get = Counter(), zarr.storage.LocalStore.get
+
+    async def counted(store, key, *arguments, **named):
+        if key.startswith("displacement/c."):
+            reads[int(key.split(".")[1])] += 1
+        return await get(store, key, *arguments, **named)
+
+    monkeypatch.setattr(zarr.storage.LocalStore, "get", counted)
+    monkeypatch.setattr("evaluation.drawing.rendering.rendering_problem", lambda: None)
+    monkeypatch.setattr("evaluation.drawing.pictures.comparison_picture", lambda *_, **__: Figure())
+    monkeypatch.setattr("evaluation.drawing.interactive.interactive_view", lambda *_, **__: "")
+    models = (campaign / "mh0", tmp_path / "gpr")
+    done = run(campaign / "kart.zarr", *models, "-o", tmp_path / "report", "--write-vtkhdf")
+    assert done.exit_code == 0, done.output
+    assert "fold" in (tmp_path / "report" / "report.html").read_text()
+    assert [reads[k] for k in range(5)] == [1] * 5
+    assert sum(reads[k] for k in range(5, 8)) <= 9, reads
