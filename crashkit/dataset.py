@@ -18,6 +18,7 @@ import crashkit.accessor  # noqa: F401  registers `.crash`
 from crashkit.chunks import RUNS_WITH, damaged_chunk, lost_chunks
 from crashkit.errors import CrashkitError, ReadError
 from crashkit.netcdf import default_indexes, open_netcdf
+from crashkit.presence import require_dataset
 from crashkit.version import __version__
 from data_schema import VARIABLES
 from data_schema import dataset_checksum as _checksum_from
@@ -44,11 +45,8 @@ def open_dataset(
         If there is nothing, or nothing of the kind; `data_schema.validate` tells whether it is good.
     """
     path = Path(path)
-    if not path.exists():
-        raise ReadError(f"{path}: no such dataset; make one with crashkit ingest, or check the path")
+    require_dataset(path)
     is_folder = path.is_dir()
-    if is_folder and not (path / "zarr.json").exists():
-        raise ReadError(f"{path}: is a folder, but no Zarr store; expected a dataset made by crashkit ingest")
     if chunks == "stored":
         chunks = {} if importlib.util.find_spec("dask") else None
     try:

@@ -94,6 +94,7 @@ def open_campaign(
     from data_schema import fields, parameters, table_unit
     from data_schema.dimensions import dimension
     from surrogates.data.campaign import Campaign, CurveTarget, ElementTarget
+    from surrogates.physics.symmetry import check_odd
 
     with source.opened() as opened, reading_dataset(source.name):
         on_faces = [
@@ -133,6 +134,7 @@ def open_campaign(
     marks = [str(note) for note in dataset["quality_note"].values] if "quality_note" in dataset else [""] * len(runs)
     per_element = (states, dataset.sizes["face"])
     values = np.stack([dataset[n].values[chosen].astype(np.float64) for n in names], axis=1)
+    check_odd(odd, names, values, [table_unit(dataset, n) for n in names])
     two_sided = bool(((values.min(axis=0) < 0) & (values.max(axis=0) > 0)).any())
     return Campaign(
         parameters=values,

@@ -278,15 +278,20 @@ def _path_and_run(text: str) -> tuple[Path, str | None]:
     return Path(text), None
 
 
-def _read(path: Path, run: str | None, units: str) -> xr.Dataset:
-    from crashkit.dataset import open_dataset
-    from crashkit.engine import CrashBackend
+def _require(path: Path) -> None:
     from crashkit.errors import ReadError
 
     if not path.exists():
         raise ReadError(
             f"{path}: no such file or folder; expected a coarse run, such as its folder or coarse.zarr:run_012"
         )
+
+
+def _read(path: Path, run: str | None, units: str) -> xr.Dataset:
+    from crashkit.dataset import open_dataset
+    from crashkit.engine import CrashBackend
+
+    _require(path)
     if path.suffix in _SUFFIXES:
         return open_dataset(path, chunks=None)
     opened = CrashBackend().open_dataset(path, run=run)
@@ -330,17 +335,57 @@ def _held(states: NDArray[np.float32], name: str) -> NDArray[np.float32]:
     return out
 
 
-def own_parameters(given: str | Path, names: Sequence[str]) -> dict[str, float]:
-    """What a run of a dataset says of its own parameters, by name, in SI; empty for files of a solver."""
+def check_given(given: str | Path, rows: Sequence[str] | None) -> None:
+    """Refuse what cannot be a coarse run, or with `rows` cannot hold one of each name, before anything is read.
+
+    Raises
+    ------
+    ReadError, DataError
+        Where there is nothing, a single run is given for several rows, or a row has none.
+    """
     from crashkit.dataset import opened_dataset
+    from crashkit.errors import DataError
+
+    path, run = _path_and_run(str(given))
+    if rows is not None and run is not None:
+        raise DataError(
+            f"{given}: names one coarse run, and a table asks for several; give the dataset, {path}, in which each row has a "
+            f"run of its name, or ask for {run} alone with --param instead of --params"
+        )
+    _require(path)
+    if rows is None:
+        return
+    has = {entry.name for entry in path.iterdir()} if path.is_dir() else set()
+    if path.suffix in _SUFFIXES:
+        with opened_dataset(path) as dataset:
+            has = {str(n) for n in dataset["sim"].values}
+    missing = [name for name in rows if name not in has]
+    if missing:
+        more = f", nor {len(missing) - 1} more of the table's" if missing[1:] else ""
+        some = ", ".join(sorted(has)[:3]) + (", ..." if len(has) > 3 else "")
+        raise DataError(
+            f"{given}: has no run {missing[0]}{more}; expected a coarse run for each row, of the row's name; it has {some or 'none'}"
+        )
+
+
+def own_parameters(given: str | Path, names: Sequence[str]) -> dict[str, float]:
+    """What a run of a dataset says of its own parameters, by name, in SI.
+
+    Raises
+    ------
+    DataError
+        Where several runs could be meant, and for files of a solver, which do not say.
+    """
+    from crashkit.dataset import opened_dataset
+    from crashkit.errors import DataError
     from crashkit.selection import runs_of
 
     path, run = _path_and_run(str(given))
-    if path.suffix not in _SUFFIXES or not path.exists():
-        return {}
+    if path.suffix not in _SUFFIXES:
+        raise DataError(f"{given}: a solver's files do not say with which parameters; give them with --param")
     with opened_dataset(path) as dataset:
         runs = [str(n) for n in dataset["sim"].values]
         if run is None and len(runs) > 1:
-            return {}
+            raise DataError(f"{given}: holds {len(runs)} runs; name one, such as {given}:{runs[0]}")
         place = 0 if run is None else runs_of(runs, [run])[0]
         return {n: float(dataset[n].values[place]) for n in names if n in dataset}

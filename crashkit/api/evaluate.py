@@ -106,8 +106,19 @@ def evaluate(
     from crashkit.extras import need
 
     need("evaluating models", "train", "report")
+    from crashkit.output import check_folder, refuse_earlier
+    from crashkit.presence import require_dataset
+    from surrogates.storage.presence import require_model_folder
+
+    if output is not None:
+        check_folder(Path(output), "report.json")
+        if not overwrite:
+            refuse_earlier(Path(output), "report.json", "report")
+    if isinstance(dataset, (str, Path)):
+        require_dataset(dataset)
+    for folder in _folders(models):
+        require_model_folder(folder)
     from crashkit.api.source import source_of
-    from crashkit.output import refuse_earlier
     from crashkit.parallel import as_finished
     from evaluation.comparison.result import compare, decompose
     from evaluation.comparison.sensors import choose_sensors
@@ -120,8 +131,6 @@ def evaluate(
 
     tell = watched(report, progress)
     formats = [suffix for suffix, wanted in ((".pvd", write_vtu), (".vtkhdf", write_vtkhdf)) if wanted]
-    if output is not None and not overwrite:
-        refuse_earlier(Path(output), "report.json", "report")
     source = source_of(dataset, hierarchy)
     asked = _asked(models)
     reference, stored = _opened(source, asked)
@@ -277,6 +286,12 @@ def _folder(output: str | Path | None) -> contextlib.AbstractContextManager[Path
 def _scratch() -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="crashkit-") as folder:
         yield Path(folder)
+
+
+def _folders(models: GivenModel | Sequence[GivenModel]) -> list[Path]:
+    """Those of `models` that are given as folders."""
+    several = [models] if isinstance(models, (str, Path)) or not isinstance(models, Sequence) else models
+    return [Path(given) for given in several if isinstance(given, (str, Path))]
 
 
 def _asked(models: GivenModel | Sequence[GivenModel]) -> tuple[tuple[str, Trained | Path], ...]:

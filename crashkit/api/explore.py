@@ -55,13 +55,8 @@ def explore(
     from crashkit.extras import need
 
     need("a page with sliders", "train")
-    import numpy as np
-
-    from crashkit.api.predict import load_model
     from crashkit.errors import DataError, OutputError
-    from data_schema.replace import beside
-    from evaluation.explorer.page import BrowserModel, ExplorerMesh, explorer_page
-    from surrogates.storage.browser import browsable
+    from surrogates.storage.presence import require_model_folder
 
     output = Path(output)
     if output.suffix.lower() not in (".html", ".htm"):
@@ -69,6 +64,15 @@ def explore(
     if output.exists() and not overwrite:
         raise OutputError(f"{output}: is there already; replace it with --overwrite, or choose another name")
     folders = [Path(models)] if isinstance(models, (str, Path)) else [Path(m) for m in models]
+    for folder in folders:
+        require_model_folder(folder)
+    import numpy as np
+
+    from crashkit.api.predict import load_model
+    from data_schema.replace import beside
+    from evaluation.explorer.page import BrowserModel, ExplorerMesh, explorer_page
+    from surrogates.storage.browser import browsable
+
     loaded = [load_model(folder).surrogate for folder in folders]
     first = loaded[0]
     if first.points is None or first.faces is None:

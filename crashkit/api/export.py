@@ -98,9 +98,13 @@ def export_model(
     from crashkit.extras import need
 
     need("exporting a model", "train")
-    from crashkit.api.predict import model_in_hand
     from crashkit.output import refuse_there
-    from surrogates.storage.export import export
+    from surrogates.storage.presence import require_model_folder
 
     refuse_there([Path(output)], overwrite)
+    if isinstance(model, (str, Path)):
+        require_model_folder(model)
+    from crashkit.api.predict import model_in_hand
+    from surrogates.storage.export import export
+
     return export(model_in_hand(model).surrogate, Path(output), level, full=full)

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crashkit.api.series import SeriesNote, stored_model
+from crashkit.presence import require_dataset
 from data_schema.progress import Progress, silent
 from data_schema.replace import sweep
+from surrogates.storage.presence import require_model_folder
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -192,12 +194,28 @@ def predict_runs(
     from crashkit.output import refuse_there
     from crashkit.parallel import as_finished
 
+    if isinstance(model, (str, Path)):
+        require_model_folder(model)
+    if dataset is not None:
+        require_dataset(dataset)
+    rows = () if table is None else tuple(_rows(Path(output), Path(table)))
+    if coarse_run is not None:
+        from crashkit.api.coarse_runs import check_given
+
+        check_given(coarse_run, None if table is None else [row.run for row in rows])
+    if table is not None and not (resume or overwrite) and SeriesNote(Path(output), {}).is_there():
+        raise OutputError(
+            f"{output}: holds runs of a series; go on with it with --resume, replace it with --overwrite, or choose another "
+            "place"
+        )
+    if not resume:
+        refuse_there([Path(output)] if table is None else [row.output for row in rows], overwrite)
     asked = model_in_hand(model)
     if coarse_run is not None and table is None and run is None and not parameters:
         from crashkit.api.coarse_runs import own_parameters
 
         parameters = own_parameters(coarse_run, asked.record.ranges.names)
-    wanted = _wanted(asked.record, Path(output), parameters, table, run, dataset)
+    wanted = _wanted(asked.record, Path(output), parameters, table, rows, run, dataset)
     how = _How(
         time, level, full, extrapolate, band, sensitivity, hide_above, template, coarse_run, several=table is not None
     )
@@ -205,11 +223,6 @@ def predict_runs(
     if resume and series is None:
         raise DataError("resume goes on with the rows of a table, by a model in its folder; give both")
     found = _written_before(series, wanted) if series is not None and resume else {}
-    if series is not None and not (resume or overwrite) and series.is_there():
-        raise OutputError(
-            f"{output}: holds runs of a series; go on with it with --resume, replace it with --overwrite, or choose another "
-            "place"
-        )
     refuse_there((one.output for one in wanted if series is None or not series.owns(one.output)), overwrite)
     if table is not None:
         _check_rows(asked, wanted, table, time, extrapolate)
@@ -368,6 +381,7 @@ def _wanted(
     output: Path,
     parameters: Mapping[str, Any] | None,
     table: str | Path | None,
+    rows: Sequence[_Row],
     run: str | int | None,
     dataset: str | Path | None,
 ) -> list[_Wanted]:
@@ -376,13 +390,31 @@ def _wanted(
     if sum(given is not None for given in (parameters, table, run)) != 1 or (run is None) != (dataset is None):
         raise DataError("expected either parameters, or a table, or a run with its dataset")
     if table is not None:
-        return _of_table(record, output, Path(table))
+        return [_of_row(record, Path(table), row) for row in rows]
     if run is not None and dataset is not None:
         return [_known(record, output, run, Path(dataset))]
     return [_Wanted("", parameters or {}, output)]
 
 
-def _of_table(record: Record, output: Path, table: Path) -> list[_Wanted]:
+@dataclass(frozen=True)
+class _Row:
+    """A row of a table: its run, what stands in it (value, unit) by name, and its file."""
+
+    run: str
+    values: Mapping[str, tuple[float, str]]
+    output: Path
+
+
+def _rows(output: Path, table: Path) -> list[_Row]:
+    """The rows of a table, each with a file of its own; nothing of the model is needed.
+
+    Raises
+    ------
+    ReadError, DataError
+        For the table.
+    OutputError
+        Where two rows would be written to one file, or nothing of the kind can be.
+    """
     from crashkit.api.predict import D3PLOT, SUFFIXES
     from crashkit.errors import OutputError
     from crashkit.ingestion.parameter_table import read_parameter_table
@@ -390,29 +422,53 @@ def _of_table(record: Record, output: Path, table: Path) -> list[_Wanted]:
 
     if output.suffix and output.suffix not in SUFFIXES:
         raise OutputError(f"{output}: of a table, expected a folder, or NAME.pvd, NAME.vtkhdf or NAME.npz")
-    if output.name == D3PLOT:
-        return [
-            _Wanted(row.run, row.parameters, output / row.output.stem)
-            for row in _of_table(record, output.with_name("of_a_table"), table)
-        ]
-    wanted = [
-        _Wanted(
-            row,
-            {n: f"{v!r}{unit}" for n, (v, unit) in values.items() if n in record.ranges.names},
-            output.with_name(f"{output.stem}_{file_name(row)}{output.suffix}")
-            if output.suffix
-            else output / f"{file_name(row)}.pvd",
-        )
-        for row, values in read_parameter_table(table, numbered=True).rows.items()
-    ]
-    rows: dict[str, str] = {}  # by the file's name, in which some systems do not tell capitals apart
-    for one in wanted:
-        other = rows.setdefault(one.output.name.lower(), one.run)
+
+    def file_of(run: str) -> Path:
+        if output.name == D3PLOT:
+            return output / file_name(run)
+        if output.suffix:
+            return output.with_name(f"{output.stem}_{file_name(run)}{output.suffix}")
+        return output / f"{file_name(run)}.pvd"
+
+    found = read_parameter_table(table, numbered=True)
+    rows = [_Row(run, values, file_of(run)) for run, values in found.rows.items()]
+    runs: dict[str, str] = {}  # by the file's name, in which some systems do not tell capitals apart
+    for one in rows:
+        other = runs.setdefault(one.output.name.lower(), one.run)
         if other != one.run:
             raise OutputError(
                 f"{table}: rows {other!r} and {one.run!r} would both be written to {one.output.name}; rename one of them"
             )
-    return wanted
+    return rows
+
+
+def _of_row(record: Record, table: Path, row: _Row) -> _Wanted:
+    """What is asked for in a row: the parameters of the model, whatever their capitals; other columns are left aside.
+
+    Raises
+    ------
+    DataError
+        For a column that would be a parameter of the model if what stands behind its name were a unit.
+    """
+    from crashkit.errors import DataError
+
+    spelled = {name.lower(): name for name in row.values}
+    parameters = {}
+    for name in record.ranges.names:
+        found = name if name in row.values else spelled.get(name.lower())
+        if found is None:
+            longer = [n for n in row.values if n.lower().startswith(f"{name.lower()}_")]
+            longer = [n for n in longer if n not in record.ranges.names]
+            if longer:
+                behind, unit = longer[0][len(name) + 1 :], record.ranges.written[record.ranges.names.index(name)][0]
+                raise DataError(
+                    f"{table}: {behind!r} behind {name} is no unit that is known; the model has it in "
+                    f"{unit or 'no unit'}: name the column '{name} [{unit or '1'}]'"
+                )
+            continue
+        value, unit = row.values[found]
+        parameters[name] = f"{value!r}{unit}"
+    return _Wanted(row.run, parameters, row.output)
 
 
 def _known(record: Record, output: Path, run: str | int, dataset: Path) -> _Wanted:

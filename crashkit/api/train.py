@@ -119,16 +119,12 @@ def train(
 
     need("training a model", "train")
     from crashkit.api.campaign import open_campaign
-    from crashkit.api.model import Model
-    from crashkit.api.numbers import NumberJudge
     from crashkit.api.source import source_of
     from crashkit.output import check_model_folder
+    from crashkit.presence import require_dataset
+    from surrogates.devices import check_device_name
     from surrogates.errors import SurrogateError
     from surrogates.settings import settings as all_settings
-    from surrogates.storage.folder import save
-    from surrogates.training.checkpoints import Checkpoints
-    from surrogates.training.loop import Diverged
-    from surrogates.training.train import train_surrogate
 
     given: dict[str, Any] = {} if seed is None else {"seed": seed}
     given |= {} if seeds is None else {"seeds": seeds}
@@ -136,11 +132,17 @@ def train(
     if targets:
         given["targets"] = list(dict.fromkeys(["displacement", *targets]))
     chosen = all_settings(model, preset, config, [settings, given])
+    check_device_name(device)
     folder = None if output is None else Path(output)
     if folder is not None:
         check_model_folder(folder, overwrite)
     elif resume:
         raise SurrogateError("resume goes on with a training beside its model folder; give output")
+    if coarse is not None and chosen.model != "pod-gpr":
+        raise SurrogateError(f"coarse runs go beneath pod-gpr, and the model is {chosen.model}; train pod-gpr")
+    for given_path in (dataset, coarse):
+        if isinstance(given_path, (str, Path)):
+            require_dataset(given_path)
     symmetry = chosen.model in ("mh", "podnn", "pod-gpr", "pod-rbf") and chosen.physics.symmetry == "auto"
     odd = chosen.physics.odd or ()
     source = source_of(dataset, hierarchy)
@@ -149,9 +151,15 @@ def train(
     if coarse is not None:
         from crashkit.api.coarse_runs import coarse_runs
 
-        if chosen.model != "pod-gpr":
-            raise SurrogateError(f"coarse runs go beneath pod-gpr, and the model is {chosen.model}; train pod-gpr")
         campaign = replace(campaign, coarse=coarse_runs(coarse, campaign, source))
+    # From here on torch is needed: what can be refused without it was.
+    from crashkit.api.model import Model
+    from crashkit.api.numbers import NumberJudge
+    from surrogates.storage.folder import save
+    from surrogates.training.checkpoints import Checkpoints
+    from surrogates.training.loop import Diverged
+    from surrogates.training.train import train_surrogate
+
     judge = NumberJudge.of(chosen, campaign)
     state = None if folder is None else folder.with_name(f".{folder.name}.training")
     with (

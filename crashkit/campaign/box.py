@@ -39,6 +39,11 @@ class Range(BaseModel):
             raise ValueError(
                 f"low {self.low:g} and high {self.high:g} make no range; expected low < high (leave out what is not varied)"
             )
+        if self.odd and max(self.low, -self.high) > 0.1 * (self.high - self.low):
+            raise ValueError(
+                f"{self.low:g} to {self.high:g} is marked odd; what changes its sign in the mirror has values on both sides of "
+                "zero, or from zero on, such as an angle or an offset; leave odd out"
+            )
         return self
 
 

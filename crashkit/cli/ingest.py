@@ -10,12 +10,11 @@ import typer
 
 from crashkit.cli._console import fail, names, print_json, say, table, what_next
 from crashkit.cli._progress import Progress
+from crashkit.cli._times import times
 
 if TYPE_CHECKING:
     from crashkit.ingestion.ingest import IngestSummary
 
-# More common times than this are a slip of the keyboard.
-_MOST_TIMES = 100_000
 # Marked runs that are listed one by one.
 _MOST_MARKED = 10
 
@@ -51,7 +50,8 @@ def command(
     time: Annotated[
         str,
         typer.Option(
-            help="Common output times in s, begin:end:count, such as 0:0.03:61.", show_default="the runs' own"
+            help="Common output times, start:stop:number, such as 0:0.03:61 (s) or 0:30ms:61.",
+            show_default="the runs' own",
         ),
     ] = "",
     on_error: Annotated[str, typer.Option(help="stop at a run that cannot be used, or skip it.")] = "stop",
@@ -98,7 +98,7 @@ def command(
             summary = ingest(
                 sources, output, params=params, units=units, reader=reader, mesh=mesh, time_step=time_step,
                 names=run_names, parts=names(parts), exclude_parts=names(exclude_parts),
-                keep_rigid_walls=keep_rigid_walls, fields=names(fields), time=_times(time),
+                keep_rigid_walls=keep_rigid_walls, fields=names(fields), time=times(time),
                 on_error="skip" if on_error == "skip" else "stop", allow_incomplete=allow_incomplete,
                 overwrite=overwrite, quality="refuse" if quality == "refuse" else "mark", limits=limits,
                 workers=workers, scheduler=scheduler,
@@ -160,18 +160,3 @@ def _limits(texts: Iterable[str]) -> dict[str, float | None]:
                 f"{text!r}; expected NAME=PER CENT, such as energy_error=5 or mass_added=none", param_hint="--limit"
             ) from error
     return out
-
-
-def _times(text: str) -> list[float] | None:
-    if not text:
-        return None
-    try:
-        begin, end, count = text.split(":")
-        first, last, n = float(begin), float(end), int(count)
-        if not 2 <= n <= _MOST_TIMES or not last > first:
-            raise ValueError
-    except ValueError as error:
-        raise typer.BadParameter(
-            f"{text!r}; expected begin:end:count, such as 0:0.03:61, with 2 to {_MOST_TIMES} times", param_hint="--time"
-        ) from error
-    return [first + (last - first) * k / (n - 1) for k in range(n)]

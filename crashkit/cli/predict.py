@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -12,6 +11,7 @@ import typer
 
 from crashkit.cli._console import fail, look_in_paraview, print_json, say, table
 from crashkit.cli._progress import Progress
+from crashkit.cli._times import times
 
 if TYPE_CHECKING:
     from crashkit.api.predict_runs import PredictedBand, PredictedRun
@@ -54,7 +54,10 @@ def command(
     ] = Path("prediction.pvd"),
     time: Annotated[
         str,
-        typer.Option(help="Times: 15ms or 0,0.01,0.02 (s without a unit).", show_default="those of the training runs"),
+        typer.Option(
+            help="Times: 15ms, or 0,0.01,0.02 (s without a unit), or start:stop:number, such as 0:30ms:4.",
+            show_default="those of the training runs",
+        ),
     ] = "",
     level: Annotated[
         int | None, typer.Option(help="Mesh level, on its own nodes.", show_default="full mesh, from the finest level")
@@ -106,14 +109,14 @@ def command(
     if bool(run) != (dataset is not None):
         fail("--run and --dataset belong together: --run run_008 --dataset crash.zarr", code=2)
     asked = None if params is not None or run else given(param or ())
-    times = _times(time)
+    at = times(time)
     with Progress(f"reading {model}", quiet=json) as shown:
         from crashkit.api.predict_runs import predict_runs
 
         try:
             rows = predict_runs(
                 model, output, parameters=asked, table=params, run=run or None,
-                dataset=dataset, time=times, level=level, full=full or None, extrapolate=extrapolate, band=band,
+                dataset=dataset, time=at, level=level, full=full or None, extrapolate=extrapolate, band=band,
                 sensitivity=sensitivity, template=template, workers=(os.cpu_count() or 1) if write_series else 1,
                 coarse_run=coarse_run or None,
                 hide_above=hide_above, overwrite=overwrite, resume=resume, report=shown.step,
@@ -183,20 +186,6 @@ def given(texts: Iterable[str], option: str = "--param", example: str = "impact_
             raise typer.BadParameter(f"{name.strip()} is given twice", param_hint=option)
         out[name.strip()] = value
     return out
-
-
-def _times(text: str) -> list[float] | None:
-    from data_schema.units import UnknownUnits, duration
-
-    try:
-        times = [duration(piece) for piece in text.split(",")] if text else []
-    except UnknownUnits as error:
-        raise typer.BadParameter(
-            f"{error}; expected seconds, or times with a unit, such as 15ms or 0,0.01,0.02", param_hint="--time"
-        ) from error
-    if any(b <= a for a, b in itertools.pairwise(times)):
-        raise typer.BadParameter(f"{text!r}; expected increasing times, each once", param_hint="--time")
-    return times or None
 
 
 def _readable(value: float, unit: str, half_width: float | None) -> str:

@@ -115,6 +115,11 @@ class ComparedModel:
     hard: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
+    def seeds(self) -> tuple[int, ...]:
+        """Of all its trainings; empty where nothing is random."""
+        return () if self.seed is None else tuple(range(self.seed, self.seed + self.averaged))
+
+    @property
     def kind(self) -> str:
         """What models that differ in nothing but the seed have in common."""
         return json.dumps([self.configuration, self.beneath], sort_keys=True, default=str)

@@ -7,6 +7,7 @@ against each other.
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -104,6 +105,28 @@ def _without_seed(name: str) -> str:
     return re.sub(r"[-_. ]*(seed|s)?[-_. ]*\d+$", "", name) or name
 
 
+def _check_seeds(models: Sequence[ComparedModel]) -> None:
+    """Raise EvaluationError where two models of one row share a training: a spread over seeds would be too small."""
+    for one, other in itertools.combinations(models, 2):
+        common = sorted(set(one.seeds) & set(other.seeds))
+        if one.seed == other.seed and one.averaged == other.averaged:
+            raise EvaluationError(
+                f"{one.name} and {other.name} have the same settings and the same seed ({one.seed}), so they are one model "
+                "given twice; leave one out, or train it again with another --seed"
+            )
+        if common:
+            after = max(*one.seeds, *other.seeds) + 1
+            raise EvaluationError(
+                f"{one.name} is made of the seeds {_seeds(one)} and {other.name} of {_seeds(other)}, so they share "
+                f"{', '.join(map(str, common))} and are not independent; leave one out, or train it again with --seed {after}"
+            )
+
+
+def _seeds(model: ComparedModel) -> str:
+    first, *more = model.seeds
+    return f"{first} to {more[-1]}" if more else str(first)
+
+
 def entries(models: Sequence[ComparedModel], seeds_as_spread: bool = True) -> tuple[Entry, ...]:
     """The rows of the comparison, in the order the models were given.
 
@@ -123,13 +146,7 @@ def entries(models: Sequence[ComparedModel], seeds_as_spread: bool = True) -> tu
         for p, predictor in enumerate(model.predictors):
             rows.setdefault((predictor.name, kind), []).append(((m, p), predictor))
     for members in rows.values():
-        seeds = [models[key[0]].seed for key, _ in members]
-        if len(members) > 1 and len(set(seeds)) < len(seeds):
-            folders = " and ".join(models[key[0]].name for key, _ in members)
-            raise EvaluationError(
-                f"{folders} have the same settings and the same seed ({seeds[0]}), so they are one model given twice; "
-                f"leave one out, or train it again with another --seed"
-            )
+        _check_seeds([models[key[0]] for key, _ in members])
     times = [name for name, _ in rows]
     out = []
     for (name, _), members in rows.items():

@@ -33,7 +33,7 @@ from surrogates.physics.derived import (
     with_monomial,
 )
 from surrogates.physics.registration import Registration
-from surrogates.physics.symmetry import Symmetry, may_be_odd
+from surrogates.physics.symmetry import Symmetry, check_odd, may_be_odd
 from surrogates.physics.trials import Folds, Trials, courses_of, one_thread
 from surrogates.settings import Settings
 
@@ -248,7 +248,7 @@ def choose(
     settings name are inputs in every case.
     """
     search = _Search(campaign, chosen, settings, trials)
-    _check_odd(settings, search.names)
+    check_odd(settings.physics.odd or (), search.names, campaign.parameters, campaign.table_units)
     identity = _Way(search.plain)
     worth = Worth()
     if len(chosen) < FEWEST:
@@ -302,12 +302,6 @@ def not_used(registration: Registration, settings: Settings) -> list[str]:
             "did not lower the error in cross-validation"
         )
     return out
-
-
-def _check_odd(settings: Settings, names: Sequence[str]) -> None:
-    for name in settings.physics.odd or ():
-        if name not in names:
-            raise SurrogateError(f"physics.odd names {name!r}, which is no parameter; there are {', '.join(names)}")
 
 
 def _sorted(speed: int, exponents: dict[int, float]) -> tuple[tuple[int, float], ...]:

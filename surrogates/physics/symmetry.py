@@ -17,11 +17,14 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from data_schema.mirror import MirrorPlane
+from surrogates.errors import SurrogateError
 
-# Parameters that may be odd and are tried in all combinations.
 # States that are mirrored at once.
 _STATES = 16
+# Parameters that may be odd and are tried in all combinations.
 _TRIED = 3
+# An odd parameter comes at least this close to zero, as a share of its range.
+_NEAR_ZERO = 0.1
 
 
 @dataclass(frozen=True)
@@ -97,6 +100,38 @@ def mirrored(
         flat = rows @ some.transpose(1, 0, 2).reshape(some.shape[1], -1)
         out[k : k + _STATES] = (flat.reshape(-1, len(some), 3) @ turn).transpose(1, 0, 2)
     return out
+
+
+def check_odd(
+    odd: Sequence[str], names: Sequence[str], parameters: NDArray[np.float64], written: Sequence[tuple[str, float]] = ()
+) -> None:
+    """Refuse parameters of `odd` that cannot change their sign in the mirror.
+
+    Parameters
+    ----------
+    parameters
+        (run, parameter).
+    written
+        (unit, its value in that of `parameters`) in which people speak of each parameter.
+
+    Raises
+    ------
+    SurrogateError
+        For one that is no parameter, and for one that stays away from zero in all runs: no mirrored run would come near a
+        computed one.
+    """
+    for name in odd:
+        if name not in names:
+            raise SurrogateError(f"physics.odd names {name!r}, which is no parameter; there are {', '.join(names)}")
+        k = list(names).index(name)
+        low, high = float(parameters[:, k].min()), float(parameters[:, k].max())
+        if max(low, -high) > _NEAR_ZERO * (high - low):
+            unit, factor = written[k] if written else ("", 1.0)
+            raise SurrogateError(
+                f"physics.odd names {name}, which is {low / factor:.4g} to {high / factor:.4g} {unit}".rstrip()
+                + " in these runs; one that changes its sign in the mirror has values on both sides of zero, or from zero on, such as an "
+                "angle or an offset; leave it out of --odd"
+            )
 
 
 def may_be_odd(names: Sequence[str], parameters: NDArray[np.float64]) -> list[tuple[str, ...]]:

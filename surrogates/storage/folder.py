@@ -55,6 +55,8 @@ from surrogates.storage.checks import (
     check_record,
     plain_files,
 )
+from surrogates.storage.presence import MAIN as _MAIN
+from surrogates.storage.presence import require_model_folder
 from surrogates.surrogate import Surrogate
 from surrogates.uncertainty import Band, Spread
 
@@ -63,7 +65,6 @@ if TYPE_CHECKING:
     from surrogates.models.base import Network
 
 FORMAT = 2
-_MAIN = "model.json"
 _ELEMENTS = "elements.safetensors"
 _SPREADS: tuple[Spread, ...] = ("constant", "size", "deviation", "local")
 _CURVES = "curves.safetensors"
@@ -206,11 +207,8 @@ def _write(surrogate: Surrogate, folder: Path) -> None:
 
 
 def _about(folder: Path) -> dict[str, Any]:
+    require_model_folder(folder)
     path = folder / _MAIN
-    if not folder.exists():
-        raise ModelFolderError(f"{folder}: no such model folder; crashkit train makes one")
-    if not path.is_file():
-        raise ModelFolderError(f"{folder}: holds no {_MAIN}; expected a model folder made by crashkit train")
     try:
         about = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:

@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from surrogates.devices import check_device_name
 from surrogates.errors import SurrogateError
 from surrogates.record import HISTORY, Fit
 from surrogates.settings import LevelSettings
@@ -180,8 +181,7 @@ def device_of(choice: str) -> torch.device:
     there = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
     if choice == "auto":
         choice = next(k for k in ("cuda", "mps", "cpu") if there[k])
-    if choice.split(":")[0] not in there:
-        raise SurrogateError(f"device {choice!r} is not known; choose cpu, cuda, mps or auto")
+    check_device_name(choice)
     if not there[choice.split(":")[0]]:
         raise SurrogateError(
             f"device {choice!r} is not there; this machine has {', '.join(k for k in there if there[k])}"

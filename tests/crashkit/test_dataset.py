@@ -166,6 +166,33 @@ def test_impossible_split_is_told(chosen: Any) -> None:
         runs_of(NAMES, chosen)
 
 
+@pytest.mark.parametrize(
+    ("chosen", "message"),
+    [
+        ("99:", "'99:' does not fit 10 runs, which are 0 to 9; .* such as 8:10, or 8: to the end"),
+        ("8:12", "'8:12' does not fit 10 runs"),
+        ("0:3,12:", "'12:' does not fit 10 runs"),
+        ("a:b", "no range of runs; expected first:last, such as 27:36, or 27: to the end"),
+        ("1:2:3:4", "no range of runs"),
+        ("99", "99 of 10 runs were asked for; expected a fraction, or a whole number from 1 to 9"),
+    ],
+)
+def test_runs_beyond_the_last_are_told_with_those_there_are(chosen: str, message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        runs_of(NAMES, chosen)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "places"), [("7:", [7, 8, 9]), ("0:2,run_005,-1:", [0, 1, 5, 9]), (slice(8, 99), [8, 9])]
+)
+def test_ranges_without_an_end_and_in_lists(chosen: Any, places: list[int]) -> None:
+    assert runs_of(NAMES, chosen) == places
+
+
+def test_per_cent_are_a_fraction() -> None:
+    assert runs_of(NAMES, "30%") == runs_of(NAMES, 0.3)
+
+
 def test_split_keeps_order_and_everything_else(demo_dataset: Path) -> None:
     with open_dataset(demo_dataset) as ds:
         train, test = ds.crash.split(test="27:36")

@@ -98,7 +98,7 @@ TABLE: dict[str, list[Line]] = {
     ],
     "physics.clock": [line("physics.clock=auto", **POD)],  # type: ignore[arg-type]
     "physics.symmetry": [line("physics.symmetry=auto", **POD)],  # type: ignore[arg-type]
-    "physics.odd": [line("physics.odd=impact_speed", given=("physics.symmetry=auto",), **POD)],  # type: ignore[arg-type]
+    "physics.odd": [line("physics.odd=[]", given=("physics.symmetry=auto",), **POD)],  # type: ignore[arg-type]
     "validation.measure": [line("validation.measure=paper")],
     "validation.share": [line("validation.share=0.5")],
     "validation.runs": [line("validation.runs=[run_000]")],

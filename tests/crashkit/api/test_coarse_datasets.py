@@ -14,7 +14,7 @@ from crashkit.api.model import Model
 from crashkit.api.predict_runs import predict_runs
 from crashkit.api.run_study import study_steps
 from crashkit.cli import app
-from crashkit.errors import DataError
+from crashkit.errors import CrashkitError, DataError
 from crashkit.writers.d3plot import write_d3plot
 from surrogates.errors import SurrogateError
 
@@ -185,6 +185,40 @@ def test_rows_of_a_table_start_from_the_runs_of_their_names(model: Model, tmp_pa
         true = dataset(9, range(k, k + 1))["displacement"].values[0]
         found = np.load(tmp_path / f"p_run_{k}.npz")["displacement"]
         assert np.linalg.norm(found - true, axis=-1).mean() < 0.01 * np.linalg.norm(true, axis=-1).mean()
+
+
+@pytest.mark.parametrize(
+    ("table", "given", "message"),
+    [
+        (False, "nope.zarr:run_70", "nope.zarr:run_70: no such file or folder; expected a coarse run"),
+        (False, "coarse.zarr", r"coarse.zarr: holds 2 runs; name one, such as .*coarse.zarr:run_70"),
+        (False, "coarse.zarr:run_99", "there is no run 'run_99'"),
+        (False, "d3plot", "a solver's files do not say with which parameters; give them with --param"),
+        (
+            True,
+            "coarse.zarr:run_70",
+            r"names one coarse run, and a table asks for several; give the dataset, .*coarse.zarr, in",
+        ),
+        (True, "nope", "nope: no such file or folder"),
+        (
+            True,
+            "coarse.zarr",
+            "coarse.zarr: has no run c; expected a coarse run for each row, .* it has run_70, run_71",
+        ),
+        (True, "d3plot", "d3plot: has no run run_70, nor 1 more of the table's"),
+    ],
+)
+def test_what_goes_together_with_a_coarse_run(
+    model: Model, tmp_path: Path, table: bool, given: str, message: str
+) -> None:
+    dataset(5, range(70, 72), output=tmp_path / "coarse.zarr")
+    (tmp_path / "d3plot").mkdir()
+    rows = [f"{name},{at(70)['speed']!r},{1e3 * at(70)['thickness']!r}" for name in ("run_70", "c")]
+    (tmp_path / "table.csv").write_text("run,speed (m/s),thickness (mm)\n" + "\n".join(rows) + "\n")
+    asked = {"table": tmp_path / "table.csv"} if table else {}
+    with pytest.raises(CrashkitError, match=message):
+        predict_runs(model, tmp_path / "p.npz", coarse_run=f"{tmp_path / given}", **asked)
+    assert not list(tmp_path.glob("p*"))
 
 
 def test_a_study_names_its_coarse_runs(tmp_path: Path) -> None:

@@ -173,3 +173,38 @@ def test_a_series_never_mixes_two_models_or_takes_files_of_others(
     note.write_text(note.read_text()[:-30])  # killed while it wrote
     code, out, err = run("predict", model, "--params", table, "-o", tmp_path / "out", "--resume", "--json")
     assert (code, [row.get("resumed") for row in json.loads(out)]) == (0, [True, True, None]), err
+
+
+@pytest.mark.parametrize("time", ["0:30ms:4", "0:0.03:4", "0ms:30:4", "0,10ms,20ms,30ms"])
+def test_times_from_start_to_stop(model: Path, tmp_path: Path, time: str) -> None:
+    code, _, err = run("predict", model, *ASKED, "--time", time, "-o", tmp_path / "run.npz")
+    assert code == 0, err
+    assert np.load(tmp_path / "run.npz")["time"] == pytest.approx([0, 0.01, 0.02, 0.03])
+
+
+@pytest.mark.parametrize(
+    ("head", "message"),
+    [
+        (
+            "run,impact_speed (parsec/h),impact_angle,yield_stress",
+            "'parsec_h' behind impact_speed is no unit that is known",
+        ),
+        ("run,impact_speed [parsec/h],impact_angle,yield_stress", "'parsec/h'"),
+        ("run,impact_speed,impact_angle", "parameter yield_stress is missing"),
+    ],
+)
+def test_a_unit_that_is_not_known_is_named(model: Path, tmp_path: Path, head: str, message: str) -> None:
+    table = tmp_path / "runs.csv"
+    table.write_text(f"{head}\na{',20' * head.count(',')}\n")
+    code, _, err = run("predict", model, "--params", table, "-o", tmp_path / "out.npz", "--extrapolate")
+    assert code == 1
+    assert message in err
+    assert "runs.csv" in err
+
+
+def test_titles_may_have_capitals(model: Path, tmp_path: Path) -> None:
+    table = tmp_path / "runs.csv"
+    table.write_text("Run,Impact speed (km/h),IMPACT ANGLE,Yield stress [MPa]\na,72,5,400\n")
+    code, _, err = run("predict", model, "--params", table, "-o", tmp_path / "p.npz")
+    assert code == 0, err
+    assert float(np.load(tmp_path / "p_a.npz")["impact_speed"]) == pytest.approx(20)

@@ -58,3 +58,43 @@ def test_a_dataset_is_described_without_the_libraries_that_only_other_work_needs
         code + "; print([m for m in ('dask.base', 'distributed', 'pint', 'torch', 'vtkmodules') if m in sys.modules])"
     )
     assert loaded.endswith("[]")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("train {data} -o m --model foo", "model 'foo' is not known"),
+        ("train nope.zarr -o m", "nope.zarr: no such dataset"),
+        ("train {data} -o m --model pod-gpr --coarse nope.zarr", "nope.zarr: no such dataset"),
+        ("train {data} -o m --model mh --coarse {data}", "coarse runs go beneath pod-gpr"),
+        ("train {data} -o there", "there: exists and is no model folder"),
+        ("train {data} -o m --device gpu", "device 'gpu' is not known"),
+        ("train {data} -o m --model pod-gpr --test 99:", "'99:' does not fit 36 runs"),
+        ("train {data} -o m --model pod-gpr --odd yield_stress", "physics.odd names yield_stress, which is 1"),
+        ("evaluate {data} nope -o r", "nope: no such model folder"),
+        ("evaluate nope.zarr there -o r", "nope.zarr: no such dataset"),
+        ("evaluate {data} nope -o there", "there: exists and holds no report.json"),
+        ("explore nope -o page.html", "nope: no such model folder"),
+        ("explore nope -o there/file.html", "there/file.html: is there already"),
+        ("export nope -o model.onnx", "nope: no such model folder"),
+        ("predict nope -p impact_speed=20", "nope: no such model folder"),
+        ("predict there -p impact_speed=20", "there: holds no model.json"),
+    ],
+)
+def test_what_can_be_refused_at_once_is_refused_before_torch_is_imported(
+    demo_dataset: Path, tmp_path: Path, arguments: str, message: str
+) -> None:
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "file.html").write_text("mine")
+    line = ["crashkit", *(word.format(data=demo_dataset) for word in arguments.split())]
+    code = f"""
+import os, sys, crashkit.cli as c
+os.chdir({str(tmp_path)!r}); sys.argv = {line!r}
+try:
+    c.app(standalone_mode=False)
+finally:
+    print([m for m in ("torch", "vtkmodules", "matplotlib") if m in sys.modules])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert message in done.stderr
+    assert done.stdout.strip() == "[]"

@@ -142,7 +142,7 @@ def test_mirror_planes_are_looked_for_where_a_parameter_may_say_the_side() -> No
     both = dataset(4)
     assert open_campaign(source_of(both), symmetry=True).mirrors
     assert not open_campaign(source_of(both)).mirrors
-    one = both.assign(impact_angle=abs(both["impact_angle"]))
+    one = both.assign(impact_angle=both["impact_angle"] - both["impact_angle"].min())
     assert not open_campaign(source_of(one), symmetry=True).mirrors
     assert open_campaign(source_of(one), symmetry=True, odd=("impact_angle",)).mirrors
 
@@ -452,7 +452,10 @@ def test_wrong_parameters_are_named(model: Path, change: dict[str, object], mess
         (("-o", "run.stl"), 1, "expected one of .pvd, .vtkhdf"),
         (("-o", "run.vtu"), 1, "holds one state, and 7 were asked for"),
         (("-o", "run.npz", "--level", "7"), 1, "level 7 was asked for"),
-        (("-o", "run.npz", "--time", "soon"), 2, "expected seconds"),
+        (("-o", "run.npz", "--time", "soon"), 2, "'soon' is no time; expected times in s or with a unit, such as 15ms"),
+        (("-o", "run.npz", "--time", "0:0.03"), 2, "or start:stop:number, such as 0:30ms:4"),
+        (("-o", "run.npz", "--time", "0:0.03:0.01"), 2, "'0.01' is no number of times from 2 to"),
+        (("-o", "run.npz", "--time", "0:30kg:4"), 2, "is no time"),
         (("-o", "run.npz", "--time", "0.02,0.01"), 2, "expected increasing times"),
         (("-o", "run.npz", "--run", "run_001"), 2, "give one of --param, --params and --run"),
         (("-o", "run.npz", "--param", "impact_speed"), 2, "expected name=value"),

@@ -92,6 +92,15 @@ def test_one_model_given_twice_is_refused(models):
         entries((models[1], replace(models[1], name="copy")))
 
 
+def test_means_that_share_a_training_are_no_seeds_of_one(models):
+    mean = replace(models[1], name="mean", seed=0, averaged=5)
+    with pytest.raises(EvaluationError, match=r"seeds 0 to 4 and mean3 of 3 to 7, so they share 3, 4 .* with --seed 8"):
+        entries((mean, replace(mean, name="mean3", seed=3)))
+    with pytest.raises(EvaluationError, match=r"seeds 0 to 4 and single of 3, so they share 3"):
+        entries((mean, replace(mean, name="single", seed=3, averaged=1)))
+    assert len(entries((mean, replace(mean, name="mean5", seed=5)))[0].keys) == 2
+
+
 def test_no_model_is_an_error():
     with pytest.raises(EvaluationError, match="no model"):
         entries(())

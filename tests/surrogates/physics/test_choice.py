@@ -150,6 +150,10 @@ def test_a_parameter_declared_odd_on_a_mesh_without_a_mirror_plane_is_named() ->
     ("override", "told"),
     [
         ("physics.odd=[weight]", "physics.odd names 'weight', which is no parameter; there are speed"),
+        (
+            "physics.odd=[speed]",
+            r"physics.odd names speed, which is \S+ to \S+ .*in these runs; one that changes its sign",
+        ),
         ("inputs.derived=speed**2/offset", "takes the logarithm of offset"),
         ("inputs.derived=speed**2/weight", "no parameter"),
         ("inputs.derived=[speed**2/strength, strength/speed**2]", "follows from the monomials named before it"),
