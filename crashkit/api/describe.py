@@ -227,6 +227,7 @@ def describe_model(surrogate: Surrogate, path: Path) -> dict[str, Any]:
             }
             for name, number in surrogate.level_names.items()
         ],
+        "error_name": record.error_name,
         "choice": record.choice,
         "coarse": record.physics.get("coarse runs", ""),
         "notes": list(record.notes),

@@ -332,8 +332,10 @@ def test_bare_numbers_are_in_the_unit_of_the_table(crash: Path, tmp_path: Path) 
     with pytest.raises(DataError, match=r"the model takes .*yield_stress \(\d\d\d(\.\d+)? to \d\d\d(\.\d+)? MPa\)"):
         predict(tmp_path / "m", {})
     assert "| yield_stress | MPa |" in (tmp_path / "m" / "card.md").read_text()
-    told = run("info", tmp_path / "m")[1]
+    code, told, err = run("info", tmp_path / "m")
+    assert code == 0, err
     assert re.search(r"yield_stress.*MPa", told)
+    assert "levels" in told
 
 
 def test_a_table_of_runs_is_predicted(model: Path, tmp_path: Path) -> None:
