@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import unicodedata
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -75,8 +76,11 @@ def complete_folder(output: Path, mark: str) -> Iterator[Path]:
 
 
 def file_name(name: str) -> str:
-    """`name` with everything that is troublesome in file names replaced by a dash."""
-    return re.sub(r"[^A-Za-z0-9_.+=-]+", "-", name).strip("-.") or "run"
+    """`name` with everything that is troublesome in file names replaced by a dash.
+
+    Letters of all languages stay, accents in one form: VTK, ParaView, HDF5, Zarr and all present file systems take them.
+    """
+    return re.sub(r"[^\w.+=-]+", "-", unicodedata.normalize("NFC", name)).strip("-.") or "run"
 
 
 def check_model_folder(output: Path, overwrite: bool) -> None:

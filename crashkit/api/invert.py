@@ -208,11 +208,14 @@ def invert(
     from crashkit.errors import DataError
     from surrogates.queries.misfit import Misfit
     from surrogates.queries.posterior import posterior
+    from surrogates.storage.presence import require_model_folder
 
-    surrogate = model_in_hand(model).surrogate
-    ranges = surrogate.record.ranges
+    if isinstance(model, (str, Path)):
+        require_model_folder(model)
     table = _read(measured)
     deviation = _length(noise)
+    surrogate = model_in_hand(model).surrogate
+    ranges = surrogate.record.ranges
     points, values, rows, notes = _placed(surrogate, table, deviation, level)
     low, high = ranges.low.copy(), ranges.high.copy()
     for name, value in known_values(known or {}, surrogate).items():

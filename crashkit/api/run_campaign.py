@@ -302,7 +302,7 @@ def points_of_table(path: Path, names: Sequence[str], units: Sequence[str]) -> N
     from crashkit.ingestion.parameter_table import read_numbers
     from data_schema import to_si
 
-    table = read_numbers(path, [n.lower() for n in names], aside=("run", "sim", "name"))
+    table = read_numbers(path, [n.lower() for n in names], aside=("run", "sim", "name"), what="table of runs")
     places = {name: k for k, (name, _) in enumerate(table.columns)}
     if sorted(places) != sorted(names):
         other = sorted(set(places) ^ set(names))[0]

@@ -35,12 +35,23 @@ def fail(message: str, code: int = 1) -> NoReturn:
 def say(message: str, *, wrap: bool = True) -> None:
     """A line for people, on stderr; what its encoding lacks is written as `\\xe9` instead of ending in an error.
 
-    On a terminal that is narrower, it is broken between words; in a file or a pipe it stays one line.
+    On a terminal that is narrower, it is broken between words; in a file or a pipe it stays one line. Where work is shown on
+    a live line, the message stands above it, on a line of its own.
     """
     encoding = getattr(sys.stderr, "encoding", None) or "utf-8"
     if wrap and sys.stderr.isatty():
         message = wrapped(message, shutil.get_terminal_size().columns)
-    typer.echo(message.encode(encoding, "backslashreplace").decode(encoding), err=True)
+    message = message.encode(encoding, "backslashreplace").decode(encoding)
+    if LIVE:
+        from rich.text import Text
+
+        LIVE[-1].print(Text(message), soft_wrap=True)
+    else:
+        typer.echo(message, err=True)
+
+
+# Consoles that show a live line now, the last one on top.
+LIVE: list[Console] = []
 
 
 def wrapped(text: str, width: int) -> str:
@@ -101,13 +112,13 @@ def _plain(value: Any) -> Any:
 
 
 def table(title: str, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
-    """A table on stdout; the first column is text, the others are right-aligned."""
+    """A table on stdout; the first column is text, the others are right-aligned. What is too long is folded, never cut."""
     from rich.table import Table
     from rich.text import Text
 
     out = Table(title=Text(title), title_justify="left")
     for k, column in enumerate(columns):
-        out.add_column(column, justify="left" if k == 0 else "right")
+        out.add_column(column, justify="left" if k == 0 else "right", overflow="fold")
     for row in rows:
         out.add_row(*(Text(str(cell)) for cell in row))
     console().print(out)

@@ -14,10 +14,11 @@ import logging
 import sys
 import threading
 import time
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
 
-from crashkit.cli._console import console, say
+from crashkit.cli._console import LIVE, console, say
 
 _ROOMS = ("crashkit", "surrogates", "evaluation")
 SILENCE = 3.5  # seconds without a line, after which one says that the work goes on
@@ -36,6 +37,19 @@ def _left(seconds: float) -> str:
     return f"{seconds:.0f} s left" if seconds < 120 else f"{seconds / 60:.0f} min left"
 
 
+@dataclass(frozen=True)
+class _Told:
+    """What is being done, and how many seconds it was expected to take when it was told; None where nobody knows."""
+
+    text: str
+    left: float | None = None
+
+    def after(self, seconds: float) -> str:
+        """The line `seconds` later; nothing is said of the time left once it is over."""
+        left = None if self.left is None else self.left - seconds
+        return self.text if left is None or (seconds and left <= 0) else f"{self.text} | {_left(left)}"
+
+
 class Progress:
     """Shows what is being done; a context.
 
@@ -47,10 +61,10 @@ class Progress:
         self._live = not quiet and sys.stderr.isatty()
         self._lock = threading.RLock()
         self._now = what
-        self._text = what
+        self._text = _Told(what)
         self._begun: dict[str, tuple[float, int]] = {}
         self._said = ""
-        self._last = self._since = time.monotonic()
+        self._last = self._since = self._told_at = time.monotonic()
         self._end = threading.Event()
         self._shown: Any = None
         self._levels: dict[str, int] = {}
@@ -70,6 +84,7 @@ class Progress:
 
             self._shown = Status(self._now, console=console(stderr=True))
             self._shown.start()
+            LIVE.append(self._shown.console)
         threading.Thread(target=self._watch, daemon=True).start()
         return self
 
@@ -81,18 +96,20 @@ class Progress:
             logging.getLogger(name).removeHandler(self._handler)
             logging.getLogger(name).setLevel(self._levels[name])
         if self._shown is not None:
+            LIVE.remove(self._shown.console)
             self._shown.stop()
 
     def stage(self, what: str) -> None:
         """From now on `what` is being done, and nothing is counted."""
-        self._tell(what, what, finished=False)
+        self._tell(what, _Told(what), finished=False)
 
     def step(self, what: str, done: int = 0, total: int = 0, note: str = "", left: float | None = None) -> None:
         """`done` of `total` steps (0: unknown) of `what` are done; seconds left are estimated unless given."""
         begun, first = self._begun.setdefault(what, (time.monotonic(), done))
         if left is None and total and done > first:
             left = (time.monotonic() - begun) / (done - first) * (total - done)
-        self._tell(what, line(what, done, total, note, left), finished=bool(total) and done >= total)
+        told = _Told(line(what, done, total, note, None), left if left is not None and done < total else None)
+        self._tell(what, told, finished=bool(total) and done >= total)
 
     def say(self, text: str) -> None:
         """A line that stays."""
@@ -100,14 +117,15 @@ class Progress:
             with self._lock:
                 self._print(text)
 
-    def _tell(self, what: str, text: str, finished: bool) -> None:
+    def _tell(self, what: str, told: _Told, finished: bool) -> None:
         if self._quiet:
             return
         with self._lock:
             now = time.monotonic()
             if what != self._now:
                 self._now, self._since = what, now
-            self._text = f"{text} done, going on" if finished else text
+            text = told.after(0.0)
+            self._text, self._told_at = (_Told(f"{text} done, going on") if finished else told), now
             if self._shown is not None:
                 self._shown.update(_fitted(text))
             if (finished and text != self._said) or (not self._live and now - self._last >= _BETWEEN):
@@ -126,10 +144,11 @@ class Progress:
             with self._lock:
                 now = time.monotonic()
                 seconds = now - self._since
+                text = self._text.after(now - self._told_at)
                 if self._shown is not None and seconds > 1:
-                    self._shown.update(_fitted(f"{self._text} ({seconds:.0f} s)"))
+                    self._shown.update(_fitted(f"{text} ({seconds:.0f} s)"))
                 elif self._shown is None and now - self._last >= (SILENCE if self._said else FIRST):
-                    self._print(f"{self._text} ... {seconds:.0f} s")
+                    self._print(f"{text} ... {seconds:.0f} s")
 
 
 def _fitted(text: str) -> Any:

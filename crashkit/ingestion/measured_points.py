@@ -68,7 +68,7 @@ def read_measured_points(path: Path) -> MeasuredPoints:
     ReadError
         With the row and column of what is missing or cannot be understood.
     """
-    table = read_numbers(path, _KEYS)
+    table = read_numbers(path, _KEYS, what="table of measured points")
     named = {name.lower(): (k, unit) for k, (name, unit) in enumerate(table.columns)}
     values = np.array([row for _, row in table.rows], np.float64).reshape(len(table.rows), -1)
     numbers = np.array([number for number, _ in table.rows], np.int64)

@@ -196,17 +196,17 @@ class Numbers:
     rows: tuple[tuple[int, tuple[float, ...]], ...]
 
 
-def read_numbers(path: Path, keys: Sequence[str], aside: Sequence[str] = ()) -> Numbers:
+def read_numbers(path: Path, keys: Sequence[str], aside: Sequence[str] = (), what: str = "table of numbers") -> Numbers:
     """A table with numbers in every column, such as measured points; its header has at least one of `keys`.
 
-    Columns called as in `aside` are left out.
+    Columns called as in `aside` are left out. Messages call it `what`.
 
     Raises
     ------
     ReadError
         With the row and column of what cannot be understood.
     """
-    table = _load(path, keys)
+    table = _load(path, keys, what)
     every = [k for k, title in enumerate(table.header) if _plain(title) not in aside]
     columns = parameter_columns([table.header[k] for k in every], [""] * len(every), str(path))
     first = next((k for name in keys for k in _called(table.header, name)), 0)
@@ -232,12 +232,14 @@ def read_numbers(path: Path, keys: Sequence[str], aside: Sequence[str] = ()) -> 
     return Numbers(named, tuple(rows))
 
 
-def _load(path: Path, keys: Sequence[str]) -> _Table:
+def _load(path: Path, keys: Sequence[str], what: str = "parameter table") -> _Table:
+    if path.is_dir():
+        raise ReadError(f"{path}: is a folder; expected a {what} ({', '.join(SUFFIXES)})")
     if not path.is_file():
-        raise ReadError(f"{path}: no such parameter table")
+        raise ReadError(f"{path}: no such {what}; expected a file ({', '.join(SUFFIXES)})")
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        raise ReadError(f"{path}: a parameter table is {', '.join(SUFFIXES)}, not {suffix or 'without suffix'}")
+        raise ReadError(f"{path}: a {what} is {', '.join(SUFFIXES)}, not {suffix or 'without suffix'}")
     if path.stat().st_size > _MOST_BYTES:
         raise ReadError(f"{path}: has {path.stat().st_size >> 20} MB; expected a table with a row a run, below 64 MB")
     read = {".json": _json_rows, ".xlsx": _workbook_rows, ".csv": _text_rows, ".tsv": _text_rows}[suffix]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -29,6 +30,7 @@ from surrogates.training.loop import fit as run_epochs
 from surrogates.training.objectives import LatentObjective, LevelObjective, Samples, UnifiedObjective, as_states, chunk
 from surrogates.training.starts import pod_start, start_level, start_unified
 
+_log = logging.getLogger(__name__)
 # Share of the largest displacement below which a first state is undeformed.
 UNDEFORMED = 1e-6
 
@@ -108,10 +110,14 @@ class Trainer:
 
     def fit(self, objective: Objective, settings: LevelSettings, name: str, seed: int) -> Fit:
         """Run the training loop."""
-        return run_epochs(
+        found = run_epochs(
             objective, settings, name=name, seed=seed, precision=self.settings.precision,
             report=self.report, keeper=self.keeper,
         )  # fmt: skip
+        _log.info(
+            "%s is trained and is judged now", name
+        )  # it may have ended early, and judging takes as long at times
+        return found
 
     def on_states(
         self,

@@ -73,3 +73,5 @@ def test_what_is_there_is_replaced_only_when_asked_for(tmp_path):
 def test_names_become_file_names():
     assert file_name("run 1/2 <x>_MH1") == "run-1-2-x-_MH1"
     assert file_name("../..") == "run"
+    assert file_name("Längsträger vorn") == file_name("La\u0308ngstra\u0308ger vorn") == "Längsträger-vorn"
+    assert file_name("衝突 1") == "衝突-1"

@@ -159,3 +159,19 @@ def test_a_long_search_says_beforehand_how_long(
     monkeypatch.setattr("crashkit.api.invert._SOON", 0.0)
     crashkit.invert(model, by_node(moved), known=known, report=lambda what, *_: heard.append(what))
     assert re.fullmatch(r"searching the range, about \d+ (s|min)", heard[1])
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("nope.csv", "nope.csv: no such table of measured points; expected a file (.csv, .tsv, .json, .xlsx)"),
+        ("", ": is a folder; expected a table of measured points"),
+        ("points.txt", "points.txt: a table of measured points is .csv, .tsv, .json, .xlsx, not .txt"),
+    ],
+)
+def test_a_file_of_points_is_called_so(tmp_path: Path, name: str, message: str) -> None:
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "model.json").write_text("{}")
+    (tmp_path / "points.txt").write_text("node,ux\n1,2\n")
+    code, _, err = run("invert", tmp_path / "model", "--measured", tmp_path / name)
+    assert (code, message in " ".join(err.split())) == (1, True), err

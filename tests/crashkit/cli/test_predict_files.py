@@ -208,3 +208,17 @@ def test_titles_may_have_capitals(model: Path, tmp_path: Path) -> None:
     code, _, err = run("predict", model, "--params", table, "-o", tmp_path / "p.npz")
     assert code == 0, err
     assert float(np.load(tmp_path / "p_a.npz")["impact_speed"]) == pytest.approx(20)
+
+
+@pytest.mark.parametrize("output", ["out", "Prüf.vtkhdf", "Prüf.zarr", "d3plot"])
+def test_runs_keep_their_letters_in_file_names_that_readers_open(model: Path, tmp_path: Path, output: str) -> None:
+    table = tmp_path / "runs.csv"
+    table.write_text("run,impact_speed,impact_angle,yield_stress [MPa]\nLängsträger,15,0,300\n", "utf-8")
+    code, out, err = run("predict", model, "--params", table, "-o", tmp_path / output, "--json")
+    assert code == 0, err
+    file = Path(json.loads(out)[0]["files"][0])
+    assert "Längsträger" in str(file.relative_to(tmp_path))
+    options = {"time_step": 0.005} if output.endswith(".zarr") else {}
+    place = file.parent if output == "d3plot" else file
+    back = next(iter(reader_for(place).runs(place, **options)))
+    assert np.abs(back.displacement(0, 7)).max() > 0.1

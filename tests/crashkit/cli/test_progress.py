@@ -100,3 +100,54 @@ def test_long_lines_are_broken_between_words_and_paths_never() -> None:
     assert all(len(line) <= 40 or line.strip() == path for line in lines)
     assert [line[: len(line) - len(line.lstrip())] for line in lines] == ["  ", *["    "] * (len(lines) - 1)]
     assert " ".join(" ".join(lines).split()) == f"{'word ' * 20}{path} and more"
+
+
+def test_the_time_left_counts_down_while_nothing_is_told(capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+    monkeypatch.setattr(_progress, "FIRST", 0.0)
+    monkeypatch.setattr(_progress, "SILENCE", 0.0)
+    with Progress("starting") as shown:
+        shown.step("MH2", 32, 60, "validation 2.69 cm", left=1.6)
+        time.sleep(2.3)
+    said = capsys.readouterr().err.splitlines()
+    counted = [text.split(" ... ")[0] for text in said if text.startswith("MH2")]
+    assert "MH2 32/60 | validation 2.69 cm | 1 s left" in counted
+    assert counted[-1] == "MH2 32/60 | validation 2.69 cm"
+
+
+def test_a_message_stands_above_the_live_line(monkeypatch) -> None:
+    import io
+    import sys
+
+    class Terminal(io.StringIO):
+        encoding = "utf-8"
+
+        def isatty(self) -> bool:
+            return True
+
+    screen = Terminal()
+    monkeypatch.setattr(sys, "stderr", screen)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "80")
+    with Progress("predicting r6 6/40"):
+        time.sleep(0.3)
+        say("error: interrupted; go on with --resume")
+    before = screen.getvalue().split("error: interrupted")[0]
+    assert before.endswith("\r\x1b[2K"), "the live line is cleared first"
+    say("afterwards")
+    assert screen.getvalue().endswith("afterwards\n")
+
+
+def test_long_names_in_narrow_tables_are_folded_and_not_cut(capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+    from crashkit.cli._console import table
+
+    monkeypatch.setenv("COLUMNS", "80")
+    name = "front_longitudinal_member_left_inner_reinforcement_panel"
+    table(
+        "Parts",
+        ("part", "a long heading", "another long heading", "limit"),
+        [(name, 1, 2, "max(displacement(part=box))")],
+    )
+    out = capsys.readouterr().out
+    assert "…" not in out
+    cells = [line.split("│") for line in out.splitlines() if line.startswith("│")]
+    assert "".join(cell[1].strip() for cell in cells) == name
