@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 
 from crashkit.errors import CrashkitError
 from crashkit.extras import need
+from data_schema.memory import one_heap
 
 Item = TypeVar("Item")
 Shared = TypeVar("Shared")
@@ -165,4 +166,6 @@ def _client(workers: int, scheduler: str | None, patience: float) -> Iterator[An
             ) from error
         # A worker in the user's folder must know crashkit before it meets a class of our other packages.
         client.run(importlib.import_module, "crashkit")
+        if scheduler is None:
+            client.run(one_heap)
         yield client
