@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from surrogates.record import Record
+    from surrogates.storage.outline import Outline
     from surrogates.surrogate import Surrogate
 
 
@@ -52,9 +53,12 @@ def describe(
     if card is not None and kind != "dataset":
         raise DataError(f"{path}: is a {kind}, and a data card describes a dataset; give the path of a dataset")
     if kind == "model":
-        from crashkit.api.predict import load_model
+        from crashkit.extras import need
 
-        return describe_model(load_model(path).surrogate, path)
+        need("describing a model", "train")
+        from surrogates.storage.outline import outline
+
+        return describe_model(outline(path), path)
     if kind == "report":
         return describe_report(path)
     from crashkit.dataset import open_dataset, reading_dataset
@@ -187,26 +191,26 @@ def _levels(path: Path) -> dict[str, Any]:
     return {"levels": list(summarize_hierarchy(path)), "interpolation_errors_over": lifting_errors_over(path)}
 
 
-def describe_model(surrogate: Surrogate, path: Path) -> dict[str, Any]:
-    """The facts about the model stored in the folder `path`."""
-    record = surrogate.record
+def describe_model(outline: Outline, path: Path) -> dict[str, Any]:
+    """The facts about the model stored in the folder `path`, by its `outline`."""
+    record = outline.record
     ranges = record.ranges
     spans = zip(ranges.names, ranges.units, ranges.written, ranges.low, ranges.high, strict=True)
     return {
         "path": path,
         "bytes_on_disk": _bytes(path),
-        "kind": surrogate.settings.model,
-        "preset": surrogate.settings.preset,
+        "kind": outline.settings.model,
+        "preset": outline.settings.preset,
         "created": record.created,
         "seed": record.seed,
-        "seeds": list(surrogate.seeds),
+        "seeds": list(outline.seeds),
         "crashkit_version": record.versions.get("crashkit"),
         "checksum": record.checksum,
         **{key: str(value) for key, value in record.attributes.items()},
         "training_runs": list(record.fitted_runs),
         "validation_runs": list(record.validation_runs),
         "held_out_runs": list(record.held_out_runs),
-        "nodes": surrogate.graphs.n_nodes(0),
+        "nodes": outline.nodes,
         "states": len(record.time),
         "time_begin": ranges.time[0],
         "time_end": ranges.time[1],
@@ -216,16 +220,18 @@ def describe_model(surrogate: Surrogate, path: Path) -> dict[str, Any]:
         ],
         "levels": [
             {
-                "model": name,
-                "level": number,
-                "nodes": surrogate.graphs.n_nodes(number),
-                "latent": surrogate.n_latent(number),
-                "parameters": surrogate.n_parameters(number),
-                "validation_error": record.errors.get(name),
-                "validation_error_full": record.errors.get(f"{name}, lifted to the full mesh", record.errors.get(name)),
-                "has_band": surrogate.has_band(number),
+                "model": level.name,
+                "level": level.number,
+                "nodes": level.nodes,
+                "latent": level.latent,
+                "parameters": level.parameters,
+                "validation_error": record.errors.get(level.name),
+                "validation_error_full": record.errors.get(
+                    f"{level.name}, lifted to the full mesh", record.errors.get(level.name)
+                ),
+                "has_band": level.band,
             }
-            for name, number in surrogate.level_names.items()
+            for level in outline.levels
         ],
         "error_name": record.error_name,
         "choice": record.choice,

@@ -191,7 +191,7 @@ def _about(reference: Reference, run: int) -> dict[str, Any]:
 
 def _distance(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float32]:
     apart = a - b
-    return np.sqrt(np.einsum("...x,...x->...", apart, apart)).astype(np.float32)
+    return np.asarray(np.sqrt(np.einsum("...x,...x->...", apart, apart)), np.float32)
 
 
 def _size(points: NDArray[np.float64]) -> float:

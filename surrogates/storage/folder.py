@@ -55,7 +55,7 @@ from surrogates.storage.checks import (
     check_record,
     plain_files,
 )
-from surrogates.storage.presence import MAIN as _MAIN
+from surrogates.storage.presence import MAIN as MAIN
 from surrogates.storage.presence import require_model_folder
 from surrogates.surrogate import Surrogate
 from surrogates.uncertainty import Band, Spread
@@ -96,9 +96,9 @@ def save(surrogate: Surrogate, folder: str | Path, *, overwrite: bool = False) -
 
 def refuse_other(folder: Path, overwrite: bool) -> None:
     """Raise ModelFolderError if saving to `folder` would destroy something: anything but a model to be replaced."""
-    if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not (folder / _MAIN).exists()):
+    if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not (folder / MAIN).exists()):
         raise ModelFolderError(f"{folder}: is there already and is no model folder; choose another name")
-    if (folder / _MAIN).exists() and not overwrite:
+    if (folder / MAIN).exists() and not overwrite:
         raise ModelFolderError(f"{folder}: holds a model already; choose another name, or overwrite it")
 
 
@@ -111,19 +111,9 @@ def load(folder: str | Path) -> Surrogate:
         Naming the file that is missing, was altered, or does not fit.
     """
     folder = Path(folder)
-    about = _about(folder)
+    about, files = checked_about(folder)
     try:
-        files = plain_files(about.get("files"))
-    except SurrogateError as error:
-        raise ModelFolderError(f"{folder / _MAIN}: {error}; copy the model folder again") from error
-    for name, digest in files.items():
-        path = folder / name
-        if not path.is_file():
-            raise ModelFolderError(f"{path}: is missing; copy the whole model folder again")
-        if _sha256_of(path) != digest:
-            raise ModelFolderError(f"{path}: was altered after training; copy the model folder again, or train anew")
-    try:
-        settings = parse(about["settings"], f"{folder / _MAIN}: settings")
+        settings = parse(about["settings"], f"{folder / MAIN}: settings")
         histories = json.loads((folder / "history.json").read_text(encoding="utf-8"))
         record = record_from_dict(about["record"], {int(k): v for k, v in histories.items()})
         stored = load_file(folder / "graphs.safetensors")
@@ -163,6 +153,28 @@ def load(folder: str | Path) -> Surrogate:
     return surrogate
 
 
+def checked_about(folder: Path) -> tuple[dict[str, Any], Mapping[str, str]]:
+    """What the model in `folder` says of itself, and its files, each of which is there as it was written.
+
+    Raises
+    ------
+    ModelFolderError
+        Naming the file that is missing or was altered.
+    """
+    about = _about(folder)
+    try:
+        files = plain_files(about.get("files"))
+    except SurrogateError as error:
+        raise ModelFolderError(f"{folder / MAIN}: {error}; copy the model folder again") from error
+    for name, digest in files.items():
+        path = folder / name
+        if not path.is_file():
+            raise ModelFolderError(f"{path}: is missing; copy the whole model folder again")
+        if _sha256_of(path) != digest:
+            raise ModelFolderError(f"{path}: was altered after training; copy the model folder again, or train anew")
+    return about, files
+
+
 def _write(surrogate: Surrogate, folder: Path) -> None:
     record, core = surrogate.record, surrogate.core
     if isinstance(core, PodRegression):
@@ -194,8 +206,14 @@ def _write(surrogate: Surrogate, folder: Path) -> None:
         "registration": _plain(surrogate.registration.as_dict()),
         "levels": [
             {"number": k, "name": name, "nodes": surrogate.graphs.n_nodes(k), **_of_level(core, k)}
+            | {
+                "latent": surrogate.n_latent(k),
+                "parameters": surrogate.n_parameters(k),
+                "band": surrogate.has_band(k),
+            }
             for name, k in surrogate.level_names.items()
         ],
+        "nodes": surrogate.graphs.n_nodes(0),
         **_about_members(core),
         "curves": _plain({name: curve.told() for name, curve in surrogate.curves.items()}),
         "parts": [] if surrogate.labels is None else list(surrogate.labels.part_name),
@@ -203,12 +221,12 @@ def _write(surrogate: Surrogate, folder: Path) -> None:
         "files": {path.name: _sha256_of(path) for path in sorted(folder.iterdir())},
     }
     about["sha256"] = _sha256(_canonical(about))
-    (folder / _MAIN).write_text(json.dumps(about, indent=1), encoding="utf-8")
+    (folder / MAIN).write_text(json.dumps(about, indent=1), encoding="utf-8")
 
 
 def _about(folder: Path) -> dict[str, Any]:
     require_model_folder(folder)
-    path = folder / _MAIN
+    path = folder / MAIN
     try:
         about = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,8 @@ import pytest
 from surrogates.errors import ModelFolderError
 from surrogates.settings import settings
 from surrogates.storage.card import card
-from surrogates.storage.folder import load, save
+from surrogates.storage.folder import _canonical, _sha256, load, save
+from surrogates.storage.outline import Outline, outline
 from surrogates.surrogate import Surrogate
 from surrogates.training.train import train_surrogate
 
@@ -68,6 +71,29 @@ def test_the_card_says_which_runs_its_errors_are_of(folder: Path) -> None:
     )
     assert "## Errors on validation runs" in card(held)
     assert "Validation runs chose the weights kept" in card(held)
+
+
+def test_an_outline_says_what_the_loaded_model_would(folder: Path) -> None:
+    assert outline(folder).levels == Outline.of(load(folder)).levels
+    assert (outline(folder).nodes, outline(folder).seeds) == (81, (0,))
+    assert str(outline(folder).record) == str(load(folder).record)
+
+
+def test_an_outline_is_read_without_torch_and_refused_once_a_file_was_altered(folder: Path) -> None:
+    code = f"import sys; from surrogates.storage.outline import outline; outline({str(folder)!r}); print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+    (folder / "level_1.safetensors").write_bytes(b"other weights")
+    with pytest.raises(ModelFolderError, match=r"level_1\.safetensors: was altered"):
+        outline(folder)
+
+
+def test_a_folder_that_says_less_of_itself_is_loaded(folder: Path) -> None:
+    about = json.loads((folder / "model.json").read_text())
+    del about["nodes"], about["sha256"]
+    about["sha256"] = _sha256(_canonical(about))
+    (folder / "model.json").write_text(json.dumps(about))
+    assert outline(folder).levels == Outline.of(load(folder)).levels
 
 
 def test_nothing_in_the_folder_is_a_pickle(folder: Path) -> None:

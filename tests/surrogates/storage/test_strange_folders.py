@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import random
 import shutil
@@ -18,6 +19,7 @@ from safetensors.torch import load_file, save_file
 from surrogates.errors import ModelFolderError, SurrogateError
 from surrogates.settings import settings
 from surrogates.storage.folder import _canonical, _sha256, load, save
+from surrogates.storage.outline import outline
 from surrogates.training.train import train_surrogate
 
 
@@ -137,7 +139,17 @@ def _deep() -> Any:
 def test_a_description_of_another_kind_is_refused_in_one_line(
     stored: Path, tmp_path: Path, change: Callable[[dict[str, Any]], None]
 ) -> None:
-    ask_or_refuse(altered(stored, tmp_path / "m", "model.json", change))
+    folder = altered(stored, tmp_path / "m", "model.json", change)
+    ask_or_refuse(folder)
+    with contextlib.suppress(ModelFolderError):  # any other error is one too many
+        outline(folder)
+
+
+@pytest.mark.parametrize("value", ["many", -1, 1.5, True, None])
+def test_an_outline_counts_or_is_refused(stored: Path, tmp_path: Path, value: object) -> None:
+    folder = altered(stored, tmp_path / "m", "model.json", lambda about: about["levels"][0].update(latent=value))
+    with pytest.raises(ModelFolderError, match="where a count stands"):
+        outline(folder)
 
 
 def test_endless_json_is_refused(stored: Path, tmp_path: Path) -> None:
