@@ -57,6 +57,8 @@ class Quality:
         Mass added by mass scaling, per cent of the mass without it.
     still
         All energies are zero.
+    leap
+        A node that leaps away in one state and is back in the next, with where and how far; empty without.
     """
 
     ended: bool | None = None
@@ -64,6 +66,7 @@ class Quality:
     hourglass_share: float | None = None
     mass_added: float | None = None
     still: bool = False
+    leap: str = ""
 
     @property
     def values(self) -> dict[str, float]:
@@ -77,6 +80,8 @@ class Quality:
             out.append("the solver did not end normally")
         if self.still:
             out.append("all energies are zero: nothing moved; check the deck's initial velocity")
+        if self.leap:
+            out.append(self.leap)
         for name, value in self.values.items():
             limit = limits.get(name)
             if limit is not None and not value <= limit:

@@ -64,7 +64,8 @@ def command(
     quality: Annotated[
         str,
         typer.Option(
-            help="Runs whose energy balance, hourglass energy, added mass or end is beyond its limit: mark or refuse them."
+            help="Runs whose energy balance, hourglass energy, added mass or end is beyond its limit, or in which a node leaps "
+            "away in one state: mark or refuse them."
         ),
     ] = "mark",
     limit: Annotated[

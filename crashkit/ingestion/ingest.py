@@ -169,7 +169,8 @@ def ingest(
         answers to.
     limits
         Largest values that are fine, per cent, over `crashkit.quality.LIMITS`: energy_error (15), hourglass_share (10),
-        mass_added (10); None: no limit. A run that did not end normally or has no energy is beyond them in any case.
+        mass_added (10); None: no limit. A run that did not end normally, has no energy, or in which a single node leaps
+        away in one state and is back in the next, is beyond them in any case.
     workers
         Number of processes on this machine (a script that uses several needs `if __name__ == "__main__":`).
     scheduler

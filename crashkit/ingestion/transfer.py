@@ -13,7 +13,7 @@ import shutil
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from crashkit.errors import DataError
 from crashkit.ingestion.alignment import flags_at, interpolate, interpolation_error, same_time
 from crashkit.ingestion.curves import write_curves
+from crashkit.ingestion.leaps import Leaps
 from crashkit.ingestion.life import never_alive
 from crashkit.ingestion.run_view import Flags, RunView, gone_nodes
 from crashkit.ingestion.staging import StagedRun
@@ -130,6 +131,7 @@ def transfer(found: Found, layout: Layout, key: str, place: Path) -> StagedRun:
     finally:
         shutil.rmtree(beside, ignore_errors=True)
     quality = measured(history, Quality() if printed is None else look(*printed))
+    quality = replace(quality, leap=work.leaps.told)
     return StagedRun(key, found.name, digests, error, work.displacement, work.speed, asdict(quality))
 
 
@@ -166,6 +168,7 @@ class _Transfer:
         self._store = folder / "arrays"
         self._size = float(np.linalg.norm(np.ptp(layout.structure.position, axis=0)))
         self.displacement = self.speed = 0.0
+        self.leaps = Leaps(layout.structure, self._own, self._size)
         self._before: Block | None = None
 
     def write(self) -> tuple[dict[str, str], float]:
@@ -253,7 +256,9 @@ class _Transfer:
             for absent in (gone, before):  # a node that is gone stands at zero here
                 if absent is not None:
                     moved[absent] = 0
-            self.speed = max(self.speed, _longest(moved)[1] / float(self._own[k] - self._own[k - 1]))
+            step = _longest(moved)[1]
+            self.speed = max(self.speed, step / float(self._own[k] - self._own[k - 1]))
+            self.leaps.add(k, moved, step)
         self.displacement = max(self.displacement, largest)
         self._before = living
 

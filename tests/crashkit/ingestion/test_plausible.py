@@ -129,3 +129,47 @@ def _field(name: str):  # type: ignore[no-untyped-def]
     from crashkit.readers.base import FieldInfo
 
     return {name: (FieldInfo(name, "face"), np.zeros((5, len(plate().face_nodes)), np.float32))}
+
+
+def _leaping(state: int = 2, nodes: list[int] | None = None, by: float = 900.0) -> MemoryRun:
+    run = MemoryRun("a")
+    run.moved[state, nodes or [5], 1] += by
+    return run
+
+
+def test_a_node_that_leaps_and_is_back_is_marked_with_run_node_state_and_length(
+    tmp_path: Path, memory: RunsInMemory
+) -> None:
+    summary = run_all(tmp_path, memory, _leaping(), MemoryRun("b"))
+    told = "node 105 leaps by 0.9 m in state 2 (time 0.002 s) and is back in the next one, without its neighbours"
+    assert summary.marked == {"a": told}
+    with open_dataset(tmp_path / "o.zarr") as runs:
+        assert list(runs["quality_note"].values) == [told, ""]
+
+
+def test_a_leap_is_refused_like_other_runs_that_are_no_good(tmp_path: Path, memory: RunsInMemory) -> None:
+    with pytest.raises(DataError, match=r"run a: node 105 leaps by 0\.9 m in state 2"):
+        run_all(tmp_path, memory, _leaping(), MemoryRun("b"), quality="refuse")
+
+
+@pytest.mark.parametrize(
+    ("state", "nodes", "by"),
+    [
+        (2, list(range(13)), 900.0),  # all of them: a structure that swings
+        (2, [2, 5, 12], 900.0),  # several: no single node
+        (4, [5], 900.0),  # in the last state nobody knows whether it comes back
+        (2, [5], 3.0),  # less than a tenth of the structure
+    ],
+)
+def test_what_may_be_real_is_no_leap(
+    tmp_path: Path, memory: RunsInMemory, state: int, nodes: list[int], by: float
+) -> None:
+    assert run_all(tmp_path, memory, _leaping(state, nodes, by), MemoryRun("b")).marked == {}
+
+
+def test_a_node_that_is_gone_does_not_leap(tmp_path: Path, memory: RunsInMemory) -> None:
+    alive = np.ones((5, len(plate().face_nodes)), bool)
+    alive[3:, -2] = False  # the triangle at the tip
+    run = MemoryRun(alive=alive)
+    run.moved[3, 12] = 900.0
+    assert run_all(tmp_path, memory, run, MemoryRun("b")).marked == {}

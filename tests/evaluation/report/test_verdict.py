@@ -210,6 +210,26 @@ def test_the_smallest_worst_case_is_not_that_of_the_best_mean(evaluation):
     assert _said(two, "Smallest worst case")[0].text.startswith("MH1: on its worst test run, run_09, the mean")
 
 
+def test_a_run_beyond_the_training_runs_does_not_choose_the_smallest_worst_case(evaluation):
+    parameters = evaluation.reference.parameters.copy()
+    parameters[9:] = parameters[list(evaluation.split.train)].mean(axis=0)
+    others = {"POD_GPR": [1] * 3, "MH2": [1] * 3, "MH3": [1] * 3}
+
+    def said(parameters):
+        placed = replace(evaluation, reference=replace(evaluation.reference, parameters=parameters))
+        two = _with_errors(placed, PODNN=[0.01, 0.01, 0.05], MH1=[0.03] * 3, **others)
+        return [statement.text for statement in _said(two, "Smallest worst case")]
+
+    assert said(parameters)[0].startswith("MH1: on its worst test run")
+    parameters[11, 0] = parameters[:9, 0].max() + 0.1
+    last = evaluation.test_names[2]
+    (text,) = said(parameters)
+    assert text.startswith(f"PODNN: on its worst test run, {evaluation.test_names[0]}, the mean node error is 1.00 cm")
+    assert text.endswith(f"Left out, as outside the range of the training runs: {last}.")
+    parameters[10, 0] = parameters[11, 0]
+    assert said(parameters) == [], "one run is no worst case"
+
+
 def test_test_runs_beyond_the_training_runs_are_named_and_left_out_once(evaluation):
     parameters = evaluation.reference.parameters.copy()
     inside = parameters[list(evaluation.split.train)].mean(axis=0)
