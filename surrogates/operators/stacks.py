@@ -14,7 +14,8 @@ Source: Kneifl et al. 2024, section 3.3.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from itertools import pairwise
 from typing import Any
 
@@ -63,6 +64,73 @@ class _Decode(torch.autograd.Function):
         gradient = torch.ops.aten.elu_backward(gradients[0], 1.0, 1.0, 1.0, True, h)
         gradient_z = (weight.t() @ gradient).t() if ctx.needs_input_grad[0] else None
         return gradient_z, (z.t() @ gradient.t()).t(), gradient.sum(dim=1)
+
+
+class _EncodeLarge(torch.autograd.Function):
+    """As `_Encode`, for fewer states than latent numbers: the gradient is added to that of `weight` by the product itself.
+
+    So no second matrix of that size is made, and no time goes into adding it. `bias` has its gradient as usual.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, h: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        ctx.save_for_backward(h)
+        ctx.weight = weight
+        return torch.addmm(bias[:, None], weight, h).t()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        (h,), weight = ctx.saved_tensors, ctx.weight
+        gradient = gradients[0].t()
+        gradient_h = weight.t() @ gradient if ctx.needs_input_grad[0] else None
+        _add_product(weight, gradient, h.t())
+        return gradient_h, None, gradient.sum(dim=1)
+
+
+class _DecodeLarge(torch.autograd.Function):
+    """As `_Decode`, for fewer states than latent numbers; see `_EncodeLarge`."""
+
+    @staticmethod
+    def forward(ctx: Any, z: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        h = functional.elu(torch.addmm(bias[:, None], weight, z.t()), inplace=True)
+        ctx.save_for_backward(z, h)
+        ctx.weight = weight
+        return h
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        (z, h), weight = ctx.saved_tensors, ctx.weight
+        gradient = torch.ops.aten.elu_backward(gradients[0], 1.0, 1.0, 1.0, True, h)
+        gradient_z = gradient.t() @ weight if ctx.needs_input_grad[0] else None
+        _add_product(weight, gradient, z)
+        return gradient_z, None, gradient.sum(dim=1)
+
+
+def _add_product(weight: Tensor, a: Tensor, b: Tensor) -> None:
+    """Add a b to the gradient of `weight`."""
+    if weight.grad is None:
+        weight.grad = a @ b
+    else:
+        weight.grad.addmm_(a, b)
+
+
+_in_place = False
+
+
+@contextmanager
+def gradients_in_place() -> Iterator[None]:
+    """What is computed inside, on one thread, adds the gradients of large dense layers to their weights' own as it goes back.
+
+    Only for `backward`: what asks for gradients in another way finds none.
+    """
+    global _in_place
+    _in_place = True
+    try:
+        yield
+    finally:
+        _in_place = False
 
 
 class Convolutions(nn.Module):
@@ -123,7 +191,12 @@ class GraphEncoder(nn.Module):
         if operator.form == "dense":
             return functional.linear(h.transpose(0, 1).flatten(1), self.dense.weight, self.dense.bias)
         if _states_are_smaller(operator, self.dense.out_features, h.shape[1]):
-            return applied(_Encode, h.transpose(1, 2).reshape(-1, h.shape[1]), self.dense.weight, self.dense.bias)
+            return applied(
+                _EncodeLarge if _in_place else _Encode,
+                h.transpose(1, 2).reshape(-1, h.shape[1]),
+                self.dense.weight,
+                self.dense.bias,
+            )
         weight = self.dense.weight.unflatten(1, (operator.n_nodes, -1)).transpose(1, 2).flatten(1)
         return applied(_Encode, h.permute(2, 0, 1).reshape(-1, h.shape[1]), weight, self.dense.bias)
 
@@ -151,7 +224,7 @@ class GraphDecoder(nn.Module):
             states: Tensor = self.convolutions(h.unflatten(1, (self.n_nodes, self.channels)).transpose(0, 1))
             return states
         if _states_are_smaller(operator, self.dense.in_features, len(z)):
-            h = applied(_Decode, z, weight, bias)
+            h = applied(_DecodeLarge if _in_place else _Decode, z, weight, bias)
             x: Tensor = self.convolutions(h.view(self.n_nodes, self.channels, -1).transpose(1, 2))
             return _by_node(x)
         weight = weight.unflatten(0, (self.n_nodes, self.channels)).transpose(0, 1).flatten(0, 1)

@@ -18,11 +18,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from data_schema.memory import give_back
 from surrogates.devices import check_device_name
 from surrogates.errors import SurrogateError
 from surrogates.record import HISTORY, Fit
 from surrogates.settings import LevelSettings
 from surrogates.training.best import BestWeights
+from surrogates.training.lean import LARGE, LeanAdam
 
 if TYPE_CHECKING:
     from surrogates.surrogate import Surrogate
@@ -48,6 +50,19 @@ class Objective(nn.Module):
     def pieces(self, batch: int) -> int:
         """Into how many pieces a batch of so many samples is cut, one gradient after the other being added up."""
         return 1
+
+    @property
+    def staged(self) -> bool:
+        """Whether gradients of a step shall come in `stages`, since all of them together are large."""
+        return False
+
+    def stages(self, indices: Tensor, weights: Tensor, pieces: int) -> Iterator[Tensor]:
+        """Add up the gradients of the losses (2,) of a batch, weighted, one part of the network after the other.
+
+        After each stage it gives the losses that are known since the last one; gradients that are there are complete then,
+        and no later stage needs the weights they belong to.
+        """
+        raise NotImplementedError
 
     def networks(self) -> dict[str, nn.Module]:
         """What is trained, by name; their tensors are what best weights and checkpoints hold."""
@@ -130,8 +145,9 @@ def fit(
         del stored
     weights = torch.tensor([settings.weight_approximation, settings.weight_reconstruction], device=device)
     cut = 1 if torch.distributed.is_initialized() else objective.pieces(plan.batch)
-    kind = CapturedStep if captured and not torch.distributed.is_initialized() else _Step
-    step = kind(_distributed(objective), optimiser, weights, settings.clip, precision, cut)
+    step = _kind_of_step(objective, settings, precision, captured)(
+        _distributed(objective), optimiser, weights, settings.clip, precision, cut
+    )
     started, spent = time.perf_counter(), out.seconds
     try:
         for epoch in range(out.epochs, settings.epochs):
@@ -272,6 +288,22 @@ class _Step:
         self.optimiser.zero_grad(set_to_none=True)
 
 
+class StagedStep(_Step):
+    """A step that moves the weights of one part of the network, and forgets their gradients, before the next part's.
+
+    The results are those of a step that moves all weights together.
+    """
+
+    def taken(self, indices: Tensor) -> Tensor:
+        losses = torch.zeros_like(self.weights)
+        for of_stage in self.objective.stages(indices, self.weights, self.pieces):  # type: ignore[operator]
+            losses += of_stage
+            self.optimiser.step()
+            self.optimiser.zero_grad(set_to_none=True)
+        give_back()
+        return losses
+
+
 class CapturedStep(_Step):
     """A step whose calls are recorded once, as one CUDA graph, and then sent to the device together.
 
@@ -323,6 +355,15 @@ class CapturedStep(_Step):
         """Gradients belong to the graph."""
 
 
+def _kind_of_step(objective: Objective, settings: LevelSettings, precision: str, captured: bool) -> type[_Step]:
+    if torch.distributed.is_initialized():
+        return _Step
+    if captured:
+        return CapturedStep
+    # A limit on the gradient's norm needs all of it.
+    return StagedStep if objective.staged and not settings.clip and precision != "bfloat16" else _Step
+
+
 def _optimiser(objective: Objective, settings: LevelSettings, device: torch.device) -> torch.optim.Optimizer:
     """One group of parameters for each factor on the learning rate."""
     groups: dict[float, list[nn.Parameter]] = {}
@@ -333,6 +374,9 @@ def _optimiser(objective: Objective, settings: LevelSettings, device: torch.devi
     rate, decay = settings.learning_rate, settings.weight_decay
     given = [{"params": some, "factor": factor} for factor, some in groups.items()]
     fused = device.type in ("cpu", "cuda")
+    numbers = sum(parameter.numel() for some in groups.values() for parameter in some)
+    if device.type == "cpu" and 4 * numbers > LARGE and settings.optimiser != "sgd":
+        return LeanAdam(given, rate, decay, decoupled=settings.optimiser == "adamw")
     if settings.optimiser == "adamw":
         return torch.optim.AdamW(given, lr=rate, weight_decay=decay, fused=fused)
     if settings.optimiser == "adam":

@@ -12,12 +12,15 @@ from surrogates.data.shelf import States
 from surrogates.errors import SurrogateError
 from surrogates.models.level import Known, LevelNetwork
 from surrogates.models.unified import Unified
-from surrogates.reductions.reduction import linear_part
+from surrogates.operators.stacks import gradients_in_place
+from surrogates.reductions.reduction import DenseReduction, GraphReduction, SumReduction, linear_part
 from surrogates.training.loop import Objective
 
 # Samples handled at once outside training, and how many nodes they may have together: the widest convolution holds some
 # seventy numbers for each, a gradient some three hundred.
 _CHUNK, _NODES, _NODES_IN_TRAINING = 512, 1 << 17, 1 << 18
+# Bytes of trained weights above which, on a CPU, their gradients are not to be in memory together.
+_LARGE = 64 << 20
 
 
 def chunk(n_nodes: int) -> int:
@@ -108,7 +111,32 @@ class LevelObjective(Objective):
         return {"level": self.level}
 
     def pieces(self, batch: int) -> int:
-        return pieces(batch, self.level.n_nodes)
+        return pieces((2 if self.staged else 1) * batch, self.level.n_nodes)
+
+    @property
+    def staged(self) -> bool:
+        trained = [p for p in self.level.parameters() if p.requires_grad]
+        large = sum(4 * p.numel() for p in trained if p.device.type == "cpu") > _LARGE
+        return large and not self.level.with_initial and _parts_apart(self.level.reduction)
+
+    def stages(self, indices: Tensor, weights: Tensor, pieces: int) -> Iterator[Tensor]:
+        """First regression and decoder, from latent vectors that were encoded beforehand, then the encoder."""
+        parts = indices.tensor_split(pieces)
+        batches = [self.training_samples.batch(part) for part in parts]
+        with torch.no_grad():
+            encoded = [self.level.encode(x, known) for x, _, known, _ in batches]
+        losses = torch.zeros_like(weights)
+        for part, batch, z in zip(parts, batches, encoded, strict=True):
+            with gradients_in_place():
+                of_part = self._decoded(*batch, z.requires_grad_()) * (len(part) / len(indices))
+            (of_part * weights).sum().backward()
+            losses += of_part.detach()
+        yield losses
+        for (x, _, known, _), z in zip(batches, encoded, strict=True):
+            with gradients_in_place():
+                again = self.level.encode(x, known)
+            again.backward(z.grad)
+        yield torch.zeros_like(losses)
 
     def forward(self, index: Tensor) -> Tensor:
         return self._losses(self.training_samples, index)
@@ -131,11 +159,15 @@ class LevelObjective(Objective):
 
     def _losses(self, samples: Samples, index: Tensor) -> Tensor:
         x, inputs, known, initial = samples.batch(index)
+        return self._decoded(x, inputs, known, initial, self.level.encode(x, known))
+
+    def _decoded(self, x: Tensor, inputs: Tensor, known: Known, initial: Tensor | None, encoded: Tensor) -> Tensor:
+        """The losses (2,) of states that are `encoded`."""
         if self.reduction_alone:
-            lost = (self.level.decode(self.level.encode(x, known)) - x).square().mean().float()
+            lost = (self.level.decode(encoded) - x).square().mean().float()
             return torch.stack([lost, lost])
-        z = torch.cat([self.level.regress(inputs, known, initial), self.level.encode(x, known)])
-        difference = self.level.decode(z).unflatten(1, (2, len(index))) - x[:, None]
+        z = torch.cat([self.level.regress(inputs, known, initial), encoded])
+        difference = self.level.decode(z).unflatten(1, (2, len(encoded))) - x[:, None]
         result: Tensor = difference.square().mean(dim=(0, 2, 3)).float()
         return result
 
@@ -219,6 +251,13 @@ class UnifiedObjective(Objective):
             difference = states.unflatten(1, (2, len(index))) - self.network.restrict(x, number)[:, None]
             losses.append(difference.square().mean(dim=(0, 2, 3)))
         return torch.stack(losses).mean(dim=0).float()
+
+
+def _parts_apart(reduction: nn.Module) -> bool:
+    """Whether encoder and decoder are known to share no weights."""
+    if isinstance(reduction, SumReduction):
+        return _parts_apart(reduction.remainder)
+    return type(reduction) in (GraphReduction, DenseReduction)
 
 
 def _averaged(losses: Callable[[Samples, Tensor], Tensor], samples: Samples | None) -> Tensor | None:
