@@ -24,7 +24,7 @@ from evaluation.measures.distance import (
 Groups = Mapping[str, Sequence[NDArray[np.integer]]]
 
 # Bytes of one float32 field handled at once; a few arrays of its size come and go.
-_BLOCK = 48 << 20
+_BLOCK = 16 << 20
 
 
 def state_blocks(states: int, nodes: int) -> Iterator[slice]:
