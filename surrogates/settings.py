@@ -81,6 +81,10 @@ class LevelSettings(_Frozen):
         the MLP.
     epochs, batch
         Passes over the training states; states per step.
+    states
+        Share of the training states that an epoch goes through, others each time; `auto`: a quarter on levels of more
+        than 10 000 nodes, where training the coarser level so loses nothing on runs left out, else all. Where regressions
+        are chosen by folds, it is that of the reduction's training.
     learning_rate, schedule, optimiser, weight_decay
         Of the training; `one_cycle` and `cosine` change the rate during the training.
     clip
@@ -107,6 +111,7 @@ class LevelSettings(_Frozen):
 
     epochs: Positive = 1500
     batch: Positive = 32
+    states: Annotated[float, Field(gt=0, le=1)] | Literal["auto"] = 1.0
     learning_rate: Annotated[float, Field(gt=0)] = 1e-3
     schedule: Literal["constant", "one_cycle", "cosine"] = "constant"
     optimiser: Literal["adamw", "adam", "sgd"] = "adamw"
@@ -407,6 +412,7 @@ _FAST: dict[str, Any] = {
         "mlp": {"widths": [64] * 6, "activation": "gelu", "members": 2},
         "epochs": 300,
         "batch": 64,
+        "states": "auto",
         "learning_rate": 4e-3,
         "schedule": "one_cycle",
         "weight_decay": 0.1,

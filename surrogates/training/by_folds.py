@@ -41,6 +41,8 @@ _MATTERS = 0.02
 _GAINED = 0.5
 # Trainings of so many epochs begin with a trial of this share of them.
 _LONG, _TRIAL = 100, 0.25
+# Levels of more nodes go through this share of the states in an epoch, where the level below loses no more by it than this.
+_MANY_NODES, _FEWER, _NO_WORSE = 10_000, 0.25, 1.01
 # Sizes of latent numbers: at so many latent vectors, by this share of their spread.
 _PLACES, _STEP = 8, 0.25
 
@@ -66,6 +68,7 @@ class FoldTrainer(Trainer):
     original      the campaign as it is, and `registration` what made `campaign` of it
     part          (run,) the fold that leaves a run out, the same for a run and its image; images stand behind the runs
     chosen        what was chosen for each level, and `latents` what from
+    fewer         whether a level below lost nothing by epochs of fewer states
     """
 
     original: Campaign
@@ -73,12 +76,14 @@ class FoldTrainer(Trainer):
     part: NDArray[np.int64]
     chosen: dict[int, Chosen] = field(default_factory=dict)
     latents: dict[int, Latents] = field(default_factory=dict)
+    fewer: bool = False
 
     def level(self, number: int, cascade: Cascade, graphs: Graphs) -> Fit:
         started = time.perf_counter()
         name, runs = level_name(self.settings, number), self.runs(number, graphs)
         settings = self.settings.for_level(number, transferred=bool(cascade.numbers))
         level, epochs, interrupted = self._reduced(number, cascade, graphs, runs, settings)
+        settings = settings.model_copy(update={"states": 1.0})
         level.settle()
         latents = self._encoded(level, runs, cascade)
         chosen = choose_regression(
@@ -154,13 +159,29 @@ class FoldTrainer(Trainer):
             measured = objective.validation()
         untrained = float("inf") if measured is None or not started else float(measured[0])
         epochs = 0
+        name = level_name(self.settings, number)
+        if settings.states == "auto":
+            share = _FEWER if self.fewer and level.n_nodes > _MANY_NODES else 1.0
+            settings = settings.model_copy(update={"states": share})
+            if share < 1:
+                self.notes.add(
+                    f"{name}: an epoch goes through {100 * share:g} % of the states, as the coarser level was no worse so"
+                )
         if (_GAINED if started else 1.0) * untrained > matters:
-            name = level_name(self.settings, number)
             tried = self.fit(objective, settings, f"{name} reduction", self.seeded(number))
             if tried.status == "interrupted":
                 return level, tried.epochs, True
             best = tried.best / (settings.weight_approximation + settings.weight_reconstruction)
             epochs = tried.best_epoch if untrained - best > matters else 0
+            if self._for_the_next(number, graphs):
+                del level, objective
+                level = self._fresh(number, cascade, graphs)
+                objective = self._alone(level, runs, cascade, everyone[self.part != 0], held)
+                some = settings.model_copy(update={"states": _FEWER})
+                few = self.fit(objective, some, f"{name} reduction, fewer states", self.seeded(number))
+                if few.status == "interrupted":
+                    return level, few.epochs, True
+                self.fewer = few.best <= _NO_WORSE * tried.best
         del level, objective
         level = self._fresh(number, cascade, graphs)
         objective = self._alone(level, runs, cascade, everyone)
@@ -169,6 +190,13 @@ class FoldTrainer(Trainer):
         short = settings.model_copy(update={"epochs": epochs, "patience": 0.0})
         again = self.fit(objective, short, f"{name} reduction, all runs", self.seeded(number))
         return level, epochs, again.status == "interrupted"
+
+    def _for_the_next(self, number: int, graphs: Graphs) -> bool:
+        """Whether level `number` shall show if fewer states do: the next finer one is the first of many nodes, and wants to know."""
+        finer = [k for k in self.settings.levels or range(1, len(graphs.levels) + 1) if k < number]
+        if not finer or self.settings.for_level(max(finer)).states != "auto":
+            return False
+        return graphs.n_nodes(number) <= _MANY_NODES < graphs.n_nodes(max(finer))
 
     def _alone(
         self,

@@ -241,7 +241,8 @@ class _Plan:
                 f"a batch of {self.batch} samples cannot be shared by {self.processes} processes; choose a multiple"
             )
         self.size, self.seed, self.device = size, seed, device
-        self.steps = size // self.batch
+        share = 1.0 if settings.states == "auto" else settings.states
+        self.steps = max(1, int(share * size) // self.batch)
         self.rates = learning_rates(settings, self.steps * settings.epochs)
 
     def batches(self, epoch: int) -> Iterator[tuple[Tensor, float]]:

@@ -28,7 +28,7 @@ from surrogates.training.train import train_surrogate
 SMALL = {
     "mh": (
         "levels=[2,1]", "level.epochs=2", "level.batch=16", "level.latent=3", "level.channels=[4,5]", "level.start=plain",
-        "level.mlp.members=1", "level.patience=0", "level.first_state=learned",
+        "level.mlp.members=1", "level.patience=0", "level.first_state=learned", "level.states=1",
         "level.mlp.widths=[8]", "level.mlp.activation=elu", "level.regression=network", "level.schedule=constant",
         "level.weight_decay=0", "level.rate_inputs=0", "level.learning_rate=0.01", "transfer.upsampling=static",
         "transfer.mlp=input", "transfer.epochs=1", "validation.share=0.3", "inputs.derived=off", "physics.clock=off",
@@ -72,6 +72,7 @@ TABLE: dict[str, list[Line]] = {
     "level.first_state": [line("level.first_state=kept")],
     "level.regression": [line("level.regression=process"), line("level.regression=mean"), line("level.regression=auto")],
     "level.epochs": [line("level.epochs=3")],
+    "level.states": [line("level.states=0.5"), line("level.states=auto", on=NONE)],
     "level.batch": [line("level.batch=8")],
     "level.learning_rate": [line("level.learning_rate=0.03")],
     "level.schedule": [line("level.schedule=one_cycle"), line("level.schedule=cosine")],

@@ -137,6 +137,43 @@ def test_a_reduction_is_judged_on_runs_whose_images_it_has_not_seen(trained) -> 
     assert all(training == everyone for training, held in trainer.parted if not held)
 
 
+class Shared(Watched):
+    """Notes on which share of the states each training goes through."""
+
+    def fit(self, objective: Objective, of_level, name: str, seed: int) -> Fit:  # type: ignore[no-untyped-def]
+        self.shares = {**getattr(self, "shares", {}), name: of_level.states}
+        return super().fit(objective, of_level, name, seed)
+
+
+BOTH_AE = ("level.reduction=ae", "level.start=plain", "level.hidden=[5]", "level.latent=2", "level.patience=0")
+
+
+@pytest.mark.parametrize(("no_worse", "share"), [(100.0, 0.25), (0.0, 1.0)])
+def test_a_level_of_many_nodes_takes_fewer_states_where_the_one_below_was_no_worse_so(
+    trained, monkeypatch: pytest.MonkeyPatch, no_worse: float, share: float
+) -> None:  # type: ignore[no-untyped-def]
+    monkeypatch.setattr(by_folds, "_MANY_NODES", 10)
+    monkeypatch.setattr(by_folds, "_NO_WORSE", no_worse)
+    surrogate, trainer = trained(*BOTH_AE, trainer=Shared)
+    assert trainer.shares["MH2 reduction"] == 1.0
+    assert trainer.shares["MH2 reduction, fewer states"] == 0.25
+    assert trainer.shares["MH1 reduction"] == share
+    assert trainer.shares["MH1"] == 1.0  # the regression's
+    assert any("25 % of the states" in note for note in surrogate.record.notes) is (share < 1)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "many"), [((), 100), ((), 5), (("level.states=1",), 10)], ids=["none large", "all large", "asked for"]
+)
+def test_fewer_states_are_tried_only_below_the_first_level_of_many_nodes(
+    trained, monkeypatch: pytest.MonkeyPatch, overrides: tuple[str, ...], many: int
+) -> None:  # type: ignore[no-untyped-def]
+    monkeypatch.setattr(by_folds, "_MANY_NODES", many)
+    _, trainer = trained(*BOTH_AE, *overrides, trainer=Shared)
+    assert "MH2 reduction, fewer states" not in trainer.shares
+    assert set(trainer.shares.values()) == {1.0}
+
+
 class Told(Watched):
     """The loop says which epoch was best and how good it was; nothing is trained."""
 

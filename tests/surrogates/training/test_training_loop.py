@@ -253,6 +253,14 @@ def test_an_epoch_takes_whole_batches_each_sample_once_and_leaves_out_others_eac
     assert set().union(*epochs) == set(range(10))
 
 
+def test_an_epoch_of_a_share_takes_other_states_each_time() -> None:
+    objective = Recorder(20)
+    fit(objective, plain(batch=4, epochs=6, states=0.4), name="MH1", seed=0)
+    epochs = np.array(objective.batches).reshape(6, 8)
+    assert all(len(set(epoch)) == 8 for epoch in epochs.tolist())
+    assert len(set(epochs.ravel().tolist())) > 16
+
+
 def test_the_order_follows_from_seed_and_epoch_alone() -> None:
     first, second, other = Recorder(), Recorder(), Recorder()
     fit(first, plain(batch=3, epochs=4), name="x", seed=5)
