@@ -12,5 +12,7 @@ def require_dataset(path: str | Path) -> None:
     path = Path(path)
     if not path.exists():
         raise ReadError(f"{path}: no such dataset; make one with crashkit ingest, or check the path")
+    if (path / "model.json").exists():
+        raise ReadError(f"{path}: is a model folder; expected a dataset made by crashkit ingest")
     if path.is_dir() and not (path / "zarr.json").exists():
         raise ReadError(f"{path}: is a folder, but no Zarr store; expected a dataset made by crashkit ingest")

@@ -65,6 +65,11 @@ def _said(kind: type[BaseModel], error: ValidationError) -> str:
         near = difflib.get_close_matches(str(first["loc"][-1]), known, 1)
         return f"{place} is not known" + (f"; did you mean {near[0]}?" if near else f"; known are {', '.join(known)}")
     text = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "missing":
+        return f"{place} is missing; the file says {', '.join(map(str, first['input'])) or 'nothing'}"
+    if first["type"] in ("model_type", "model_attributes_type", "dict_type"):
+        known = _known(kind, first["loc"])
+        text = f"expected {{{', '.join(f'{name}: ..' for name in known)}}}" if known else "expected names with values"
     asked = first["type"] == "missing" or isinstance(first["input"], (dict, BaseModel))
     return (f"{place}: " if place else "") + text + ("" if asked else f", found {first['input']!r}")
 

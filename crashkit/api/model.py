@@ -228,6 +228,10 @@ class Model:
         if any(far):
             said = dict.fromkeys(of_run[name] for of_run, names in zip(beyond, far, strict=True) for name in names)
             units = [mistaken_unit(parameters, name, ranges) for name in ranges.names if any(name in f for f in far)]
+            if any("time" in f for f in far) and 1e-3 * at.max() <= self.time[-1]:
+                units.append(
+                    f"times are in s, so for {at.max():g} ms write '{at.max():g}ms', from Python {1e-3 * at.max():g}"
+                )
             raise DataError(
                 f"{'; '.join(said)}: that is far outside, and nothing is known there; "
                 f"{'; '.join(filter(None, units)) or 'check the value and its unit'}, or extrapolate: --extrapolate, "

@@ -290,9 +290,12 @@ def _idle(problem: Problem, box: Sampled, best: LocalAnswer) -> NDArray[np.bool_
 def _all_known(asked: Sequence[Formula], formulas: Mapping[str, Formula], parameters: Sequence[str]) -> None:
     """Raise DataError for a name that is neither a parameter nor a number, and say how to define it."""
     from crashkit.errors import DataError
+    from evaluation.measures.formula import FUNCTIONS
 
     for formula in [*asked, *formulas.values()]:
         for name in sorted(formula.asked):
+            if name in FUNCTIONS and name not in parameters and name not in formulas:
+                raise DataError(f"{formula.text}: {name} is a function; write {name}(), such as max(displacement())")
             if name not in parameters and name not in formulas:
                 raise DataError(
                     f"{formula.text}: {name!r} is neither a parameter ({', '.join(parameters)}) nor a number; define it: "

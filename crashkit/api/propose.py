@@ -78,6 +78,8 @@ def propose(
         box = Box.of_values(known.names, [u for u, _ in known.written], known.as_written)
     elif not isinstance(box, Box):
         box = read_box(box)
+    if known is not None:
+        known.check(box)
     if dataset is None or method != "expected-reduction":
         points = fill(
             box.low, box.high, count, seed=seed, allowed=box.allowed, edges=dataset is None,
@@ -127,6 +129,29 @@ class _Known:
     def as_written(self) -> NDArray[np.float64]:
         """(run, parameter) in the units of the table."""
         return self.values / [factor for _, factor in self.written]
+
+    def check(self, box: Box) -> None:
+        """Raise CampaignError where `box` is not one of these runs: it names other parameters, or has other units."""
+        from crashkit.campaign.box import CampaignError
+        from data_schema import to_si
+        from data_schema.units import UnknownUnits
+
+        needed = [n for n in self.names if n not in self.constant or n in box.names]
+        if missing := sorted(set(needed) ^ set(box.names)):
+            raise CampaignError(
+                f"the box and the runs differ in {', '.join(missing)}; the runs have {', '.join(self.names)}, the box "
+                f"{', '.join(box.names)}"
+            )
+        for name, unit in zip(box.names, box.units, strict=True):
+            own = self.written[self.names.index(name)][0]
+            try:
+                same = to_si(unit)[1] == to_si(own)[1]
+            except UnknownUnits as error:
+                raise CampaignError(f"{name} in the box: {error}") from error
+            if not same:
+                raise CampaignError(
+                    f"{name} is in {unit or 'no unit'} in the box and in {own or 'no unit'} in the runs"
+                )
 
     @property
     def constant(self) -> dict[str, tuple[float, str]]:

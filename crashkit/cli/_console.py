@@ -140,6 +140,20 @@ def numbers(text: str, option: str, example: str, *, kind: str = "numbers", whol
         ) from error
 
 
+def share(given: str | float) -> float:
+    """A share such as 0.9 or 90%; bad usage where it is none."""
+    text = str(given).strip()
+    percent = text.endswith("%")
+    try:
+        value = float(text.removesuffix("%")) / (100 if percent else 1)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < 1:
+        like = f"{float(text):g}%" if not percent and 1 < value < 100 else "90%"
+        raise typer.BadParameter(f"{text!r}; expected a share between 0 and 1, such as 0.9, or {like}")
+    return value
+
+
 def names(text: str) -> list[str]:
     """The names of a list such as "floor,pillar*"."""
     return [piece.strip() for piece in text.split(",") if piece.strip()]

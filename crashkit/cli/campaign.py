@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from crashkit.cli._console import fail, print_json, say, table, what_next
+from crashkit.cli._console import fail, print_json, say, share, table, what_next
 from crashkit.cli._progress import Progress
 
 
@@ -25,7 +25,12 @@ def command(
     ] = "",
     confidence: Annotated[
         float | None,
-        typer.Option(help="Probability that the error is below --until.", show_default="what the file says, or 0.9"),
+        typer.Option(
+            help="Probability that the error is below --until.",
+            parser=share,
+            metavar="SHARE",
+            show_default="what the file says, or 0.9",
+        ),
     ] = None,
     most_runs: Annotated[
         int | None, typer.Option(help="End at this number of runs.", min=1, show_default=False)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from crashkit.cli._console import print_json, say, table, what_next
+from crashkit.cli._console import print_json, say, share, table, what_next
 from crashkit.cli._progress import Progress
 
 if TYPE_CHECKING:
@@ -32,7 +32,12 @@ def command(
         typer.Option(help="A parameter that is given: impact_speed=56km/h. Repeat for more.", show_default="none"),
     ] = None,
     confidence: Annotated[
-        float, typer.Option(help="Share of cases in which each limit is to be kept; 0.5: as predicted.")
+        float,
+        typer.Option(
+            help="Share of cases in which each limit is to be kept, 0.9 or 90%; 0.5: as predicted.",
+            parser=share,
+            metavar="SHARE",
+        ),
     ] = 0.9,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")] = Path("optimum"),
     level: Annotated[int | None, typer.Option(help="Predict from this mesh level.", show_default="the finest")] = None,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from crashkit.cli._console import fail, look_in_paraview, print_json, say, table
+from crashkit.cli._console import fail, look_in_paraview, print_json, say, share, table
 from crashkit.cli._progress import Progress
 from crashkit.cli._times import times
 
@@ -68,7 +68,10 @@ def command(
     band: Annotated[
         float | None,
         typer.Option(
-            help="Also write a prediction band that should contain this share of nodes, e.g. 0.9.", show_default="none"
+            help="Also write a prediction band that should contain this share of nodes, e.g. 0.9 or 90%.",
+            parser=share,
+            metavar="SHARE",
+            show_default="none",
         ),
     ] = None,
     sensitivity: Annotated[

@@ -59,6 +59,11 @@ def command(
     ):
         if found not in allowed:
             raise typer.BadParameter(f"{found!r}; expected {' or '.join(allowed)}", param_hint=f"--{what}")
+    if "(" in vary or ".." in vary:
+        raise typer.BadParameter(
+            f"{vary!r}; expected name=width around the nominal value (-p), such as yield_stress=5% or thickness=0.1mm:uniform",
+            param_hint="--vary",
+        )
     pieces = [piece for piece in vary.split(",") if piece.strip()]
     asked = given(pieces, "--vary", "yield_stress=5%")
     numbers = {

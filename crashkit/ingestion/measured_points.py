@@ -103,6 +103,13 @@ def read_measured_points(path: Path) -> MeasuredPoints:
         np.stack([column(names, "m") for names in group], axis=1) for group in (_PLACE, _MOVED, _POSITION)
     )
     unknown = [name for k, (name, _) in enumerate(table.columns) if k not in used]
+    for name in unknown:
+        column_of = [
+            n for group in (*_PLACE, *_MOVED, *_POSITION, _TIME) for n in group if name.lower().startswith(f"{n}_")
+        ]
+        if column_of:
+            word = name[len(column_of[0]) + 1 :]
+            raise ReadError(f"{path}: column {name!r}: {word!r} behind {column_of[0]} is no unit that is known")
     if unknown:
         raise ReadError(
             f"{path}: column {unknown[0]!r} is not known; expected node or x, y, z; ux, uy, uz or px, py, pz; and time"

@@ -154,6 +154,10 @@ class Formula:
         return found
 
 
+# In which engineers write limits.
+_USUAL = {"m": "mm", "Pa": "MPa", "N": "kN", "J": "kJ", "s": "ms"}
+
+
 @dataclass(frozen=True)
 class Limit:
     """A bound that a number must keep: `intrusion < 80 mm`.
@@ -188,7 +192,7 @@ class Limit:
         if not self.unit and self.bound and powers(value.unit):
             raise EvaluationError(
                 f"{self.text}: {self.formula.text} is in {value.unit}; write the unit of the limit, such as "
-                f"'{self.formula.text} {self.sign} {self.bound:g} {value.unit}'"
+                f"'{self.formula.text} {self.sign} {self.bound:g} {_USUAL.get(value.unit, value.unit)}'"
             )
         if self.unit and powers(self.unit) != powers(value.unit):
             raise EvaluationError(

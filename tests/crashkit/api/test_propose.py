@@ -13,6 +13,7 @@ import crashkit
 from crashkit.api.propose import next_names, propose, write_table
 from crashkit.api.run_campaign import points_of_table
 from crashkit.campaign.box import Box, Range
+from crashkit.errors import CrashkitError
 from crashkit.ingestion.parameter_table import read_parameter_table
 
 QUICK = ["physics.clock=off", "physics.symmetry=off", "inputs.derived=off"]
@@ -98,3 +99,30 @@ def test_a_table_without_a_column_of_runs_is_predicted_by_its_rows(model: Path, 
 def test_a_table_is_refused_under_another_name_before_anything_is_read(tmp_path: Path) -> None:
     code, _, err = run("propose", tmp_path / "none.zarr", "-o", tmp_path / "next.xlsx")
     assert (code, "next.xlsx: a table is written as CSV; expected a name that ends in .csv" in err) == (1, True)
+
+
+@pytest.mark.parametrize(
+    ("box", "message"),
+    [
+        ("impact_speed: {low: 20, high: 90, unit: km/h}", "the box and the runs differ in impact_angle, yield_stress"),
+        (
+            "impact_speed: {low: 20, high: 90, unit: kg}\n  impact_angle: {low: -5, high: 5, unit: deg}\n"
+            "  yield_stress: {low: 200, high: 600, unit: MPa}",
+            "impact_speed is in kg in the box and in km/h in the runs",
+        ),
+        (
+            "impact_speed: [20, 90]",
+            r"parameters.impact_speed: expected {low: .., high: .., unit: .., odd: ..}, found \[20, 90\]",
+        ),
+        ("impact_speed: {low: 20}", "parameters.impact_speed.high is missing; the file says low"),
+        ("impact_speed: {low: 20, high: 60, odd: true}", "20 to 60 is marked odd"),
+    ],
+)
+def test_a_box_that_does_not_fit_is_told_before_anything_is_trained(
+    crash: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, box: str, message: str
+) -> None:
+    monkeypatch.setattr("crashkit.api.train.train", None)
+    (tmp_path / "box.yaml").write_text(f"parameters:\n  {box}\n")
+    for method in ("expected-reduction", "halton"):
+        with pytest.raises(CrashkitError, match=message):
+            propose(crash, 2, box=tmp_path / "box.yaml", method=method)  # type: ignore[arg-type]

@@ -81,6 +81,11 @@ def test_where_nothing_is_feasible_the_least_broken_is_named(model: Path, tmp_pa
         ({"minimise": "displacement()"}, "one number a run"),
         ({"minimise": "__import__('os')"}, "the function '__import__'"),
         ({"minimise": DENT, "confidence": 90}, "expected a share"),
+        ({"minimise": "max(displacement)"}, r"displacement is a function; write displacement\(\)"),
+        (
+            {"minimise": "impact_speed", "subject_to": f"{DENT} < 80"},
+            "write the unit of the limit, such as .* < 80 mm'",
+        ),
         ({"minimise": DENT, "known": {"speed": 1}}, "parameter 'speed' is not known"),
     ],
 )

@@ -222,3 +222,11 @@ def test_runs_keep_their_letters_in_file_names_that_readers_open(model: Path, tm
     place = file.parent if output == "d3plot" else file
     back = next(iter(reader_for(place).runs(place, **options)))
     assert np.abs(back.displacement(0, 7)).max() > 0.1
+
+
+def test_shares_in_per_cent_and_times_in_the_wrong_unit(model: Path, tmp_path: Path) -> None:
+    code, out, err = run("predict", model, *ASKED, "--band", "90%", "-o", tmp_path / "run.npz", "--json")
+    assert code == 0, err
+    assert json.loads(out)["band"]["share"] == 0.9
+    code, _, err = run("predict", model, *ASKED, "--time", "20", "-o", tmp_path / "late.npz")
+    assert (code, "times are in s, so for 20 ms write '20ms'" in err) == (1, True), err

@@ -79,6 +79,10 @@ def test_a_dataset_is_described_without_the_libraries_that_only_other_work_needs
         ("export nope -o model.onnx", "nope: no such model folder"),
         ("predict nope -p impact_speed=20", "nope: no such model folder"),
         ("predict there -p impact_speed=20", "there: holds no model.json"),
+        ("predict {data} -p impact_speed=20", "is a dataset; expected a model folder made by crashkit train"),
+        ("predict there -p impact_speed=20 --band 90", "'90'; expected a share between 0 and 1, such as 0.9, or 90%"),
+        ("optimise there --minimise impact_speed --confidence x", "'x'; expected a share between 0 and 1, such as 0.9"),
+        ("campaign nope.yaml --confidence 95", "'95'; expected a share between 0 and 1, such as 0.9, or 95%"),
     ],
 )
 def test_what_can_be_refused_at_once_is_refused_before_torch_is_imported(
@@ -96,5 +100,5 @@ finally:
     print([m for m in ("torch", "vtkmodules", "matplotlib") if m in sys.modules])
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert message in done.stderr
+    assert message in " ".join(done.stderr.split())
     assert done.stdout.strip() == "[]"
