@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from crashkit.cli._console import print_json, say, what_next
+from crashkit.cli._console import print_json, say, share, what_next
 from crashkit.cli._progress import Progress
 
 
@@ -15,7 +15,12 @@ def command(
     models: Annotated[list[Path], typer.Argument(help="Model folders made by `crashkit train`.", show_default=False)],
     output: Annotated[Path, typer.Option("--output", "-o", help="HTML file.")] = Path("crash.html"),
     title: Annotated[str, typer.Option(help="Heading of the page.", show_default="names of the models")] = "",
-    band: Annotated[float, typer.Option(help="Share of nodes and states that the band should hold.")] = 0.9,
+    band: Annotated[
+        float,
+        typer.Option(
+            help="Share of nodes and states that the band should hold, 0.9 or 90%.", parser=share, metavar="SHARE"
+        ),
+    ] = 0.9,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
