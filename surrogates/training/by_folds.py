@@ -163,17 +163,18 @@ class FoldTrainer(Trainer):
         if settings.states == "auto":
             share = _FEWER if self.fewer and level.n_nodes > _MANY_NODES else 1.0
             settings = settings.model_copy(update={"states": share})
-            if share < 1:
-                self.notes.add(
-                    f"{name}: an epoch goes through {100 * share:g} % of the states, as the coarser level was no worse so"
-                )
-        if (_GAINED if started else 1.0) * untrained > matters:
+        may_gain = (_GAINED if started else 1.0) * untrained > matters
+        if may_gain and settings.states != 1:
+            told = f"an epoch goes through {100 * float(settings.states):g} % of the states"
+            self.notes.add(f"{name}: {told}{', as the coarser level was no worse so' if self.fewer else ''}")
+        asked = self._for_the_next(number, graphs)
+        if may_gain or asked:
             tried = self.fit(objective, settings, f"{name} reduction", self.seeded(number))
             if tried.status == "interrupted":
                 return level, tried.epochs, True
             best = tried.best / (settings.weight_approximation + settings.weight_reconstruction)
-            epochs = tried.best_epoch if untrained - best > matters else 0
-            if self._for_the_next(number, graphs):
+            epochs = tried.best_epoch if may_gain and untrained - best > matters else 0
+            if asked:
                 del level, objective
                 level = self._fresh(number, cascade, graphs)
                 objective = self._alone(level, runs, cascade, everyone[self.part != 0], held)

@@ -174,6 +174,15 @@ def test_fewer_states_are_tried_only_below_the_first_level_of_many_nodes(
     assert set(trainer.shares.values()) == {1.0}
 
 
+def test_a_level_that_need_not_be_trained_is_asked_all_the_same(trained, monkeypatch: pytest.MonkeyPatch) -> None:  # type: ignore[no-untyped-def]
+    monkeypatch.setattr(by_folds, "_MANY_NODES", 10)
+    monkeypatch.setattr(by_folds, "_GAINED", 0.0)
+    _, trainer = trained(*BOTH_AE, "level.start=pod", trainer=Shared)
+    assert "MH2 reduction, fewer states" in trainer.shares
+    assert "MH1 reduction" not in trainer.shares
+    assert trainer.chosen[2].reduction_epochs == 0
+
+
 class Told(Watched):
     """The loop says which epoch was best and how good it was; nothing is trained."""
 
