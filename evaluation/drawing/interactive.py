@@ -34,6 +34,11 @@ _STEPS = 2**16 - 1
 _COLOURS = 64
 
 
+def shown_states(count: int, most: int = MAX_STATES) -> NDArray[np.int64]:
+    """Which of `count` states a view shows: all, or so many of them, evenly spread, with first and last."""
+    return np.unique(np.round(np.linspace(0, count - 1, min(most, count))).astype(np.int64))
+
+
 def interactive_view(
     points: ArrayLike,
     faces: ArrayLike,
@@ -81,7 +86,7 @@ def interactive_view(
         raise EvaluationError(
             f"truth {u.shape} and prediction {p.shape}: expected {len(times)} states of {len(x)} nodes x 3"
         )
-    chosen = np.unique(np.round(np.linspace(0, len(times) - 1, min(max_states, len(times)))).astype(int))
+    chosen = shown_states(len(times), max_states)
     u, p = u[chosen], p[chosen]
     living = np.ones((len(chosen), len(corners)), bool) if alive is None else np.asarray(alive, bool)[chosen]
     errors = [

@@ -176,17 +176,19 @@ def _worth(evaluation: Evaluation) -> dict[str, Columns]:
 
 def _views(evaluation: Evaluation) -> tuple[list[ShownView], str]:
     """The worst run of the best model in three dimensions, or why there is no such view."""
-    from evaluation.drawing.interactive import interactive_view
+    from evaluation.drawing.interactive import interactive_view, shown_states
 
     reference = evaluation.reference
     best = evaluation.ranked[0]
     errors = evaluation.scores[best.label].of_runs
     run = evaluation.split.test[int(np.nanargmax(errors))]
+    shown = shown_states(len(reference.time))  # others are not predicted: a run of a large mesh is large
     try:
         html = interactive_view(
-            reference.position_of(run), reference.faces, reference.time, reference.displacement(run),
-            evaluation.lifted(best, run), names=("truth", best.label), title=f"{reference.runs[run]}: {best.label}",
-            alive=None if reference.alive is None else reference.alive(run), levels=reference.levels,
+            reference.position_of(run), reference.faces, reference.time[shown], reference.displacement(run)[shown],
+            evaluation.lifted(best, run, shown.tolist()), names=("truth", best.label),
+            title=f"{reference.runs[run]}: {best.label}",
+            alive=None if reference.alive is None else reference.alive(run)[shown], levels=reference.levels,
         )  # fmt: skip
     except EvaluationError as error:
         return [], f"the interactive view ({error})"

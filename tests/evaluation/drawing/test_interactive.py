@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from crashkit.mesh.hierarchy import build_hierarchy
-from evaluation.drawing.interactive import _thinned, interactive_view
+from evaluation.drawing.interactive import _thinned, interactive_view, shown_states
 from evaluation.errors import EvaluationError
 
 TIME = np.linspace(0, 0.03, 12)
@@ -137,3 +137,10 @@ def test_a_mesh_is_thinned_to_the_nodes_of_its_faces_where_those_are_fewer() -> 
     at, faces, *_ = _thinned(x, corners, moved, moved, np.ones((1, 2), bool), (), 8)
     np.testing.assert_array_equal(at, square)
     assert sorted(map(sorted, faces.tolist())) == [[0, 1, 2], [0, 2, 3]]
+
+
+def test_states_that_are_shown_are_evenly_spread_with_first_and_last() -> None:
+    assert shown_states(5).tolist() == [0, 1, 2, 3, 4]
+    some = shown_states(64)
+    assert (len(some), some[0], some[-1]) == (31, 0, 63)
+    assert set(np.diff(some).tolist()) == {2, 3}
