@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import IO
 
 import torch
@@ -36,22 +36,22 @@ class BestWeights:
     def __bool__(self) -> bool:
         return self._kept
 
-    def keep(self, values: Mapping[str, Tensor] | None = None) -> None:
-        """Copy the tensors as they are, or `values` in their place.
+    def keep(self, value_of: Callable[[str], Tensor] | None = None) -> None:
+        """Copy the tensors as they are, or what `value_of` gives for their names, one after the other.
 
         Raises
         ------
         SurrogateError
             Where the temporary folder has no room.
         """
-        given = {name: tensor.detach() for name, tensor in (self._live if values is None else values).items()}
+        given = self._live.__getitem__ if value_of is None else value_of
         if self._file is None:
-            self._copies = {name: given[name].to(live.device, copy=True) for name, live in self._live.items()}
+            self._copies = {name: given(name).detach().to(live.device, copy=True) for name, live in self._live.items()}
         else:
             try:
                 self._file.seek(0)
                 for name in self._live:
-                    self._file.write(_bytes_of(given[name].contiguous()))
+                    self._file.write(_bytes_of(given(name).contiguous()))
             except OSError as error:
                 raise SurrogateError(
                     f"{tempfile.gettempdir()}: no room for the best weights ({error.strerror}); make room there, or "

@@ -7,6 +7,7 @@ import json
 import logging
 import shutil
 import time
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -62,15 +63,14 @@ class Checkpoints:
             folder.mkdir(parents=True)
             (folder / _IDENTITY).write_text(json.dumps(identity), encoding="utf-8")
 
-    def load(self, name: str) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
-        """Tensors and the rest of level `name`, or None."""
+    def load(self, name: str) -> tuple[Mapping[str, Tensor], dict[str, Any]] | None:
+        """Tensors, each read when it is asked for, and the rest of level `name`, or None."""
         path = self._path(name)
         if not path.exists():
             return None
         try:
             with safe_open(path, framework="pt") as file:
-                tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-                return tensors, json.loads((file.metadata() or {})["about"])
+                return _Stored(path, list(file.keys())), json.loads((file.metadata() or {})["about"])
         except (SafetensorError, KeyError, ValueError) as error:
             raise SurrogateError(f"{path}: is damaged ({error}); train again without resuming") from error
 
@@ -108,6 +108,26 @@ class Checkpoints:
                 raise SurrogateError(
                     f"{self.folder}: belongs to a training with other {key}; train without resuming, or with the same {key}"
                 )
+
+
+class _Stored(Mapping[str, Tensor]):
+    """The tensors of a file. It is opened anew for each, since what was read of an open one stays in memory."""
+
+    def __init__(self, path: Path, names: list[str]) -> None:
+        self._path, self._names = path, names
+
+    def __getitem__(self, name: str) -> Tensor:
+        if name not in self._names:
+            raise KeyError(name)
+        with safe_open(self._path, framework="pt") as file:
+            tensor: Tensor = file.get_tensor(name)
+        return tensor
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
 
 
 def _digest(campaign: Campaign) -> str:

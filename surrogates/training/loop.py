@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -105,7 +105,7 @@ class Epoch:
 class Keeper(Protocol):
     """Where a training's state goes between epochs; see `surrogates.training.checkpoints`."""
 
-    def load(self, name: str) -> tuple[dict[str, Tensor], dict[str, Any]] | None: ...
+    def load(self, name: str) -> tuple[Mapping[str, Tensor], dict[str, Any]] | None: ...
 
     def due(self, epoch: int) -> bool: ...
 
@@ -445,7 +445,7 @@ def _about(out: Fit) -> dict[str, Any]:
 
 
 def _restore(
-    stored: tuple[dict[str, Tensor], dict[str, Any]],
+    stored: tuple[Mapping[str, Tensor], dict[str, Any]],
     names: dict[str, Tensor],
     best: BestWeights,
     optimiser: torch.optim.Optimizer,
@@ -459,13 +459,15 @@ def _restore(
             value.copy_(tensors[f"now.{key}"])
     for number, parameter in enumerate(trained):
         prefix = f"optimiser.{number}."
-        state = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
-        if state:
-            optimiser.state[parameter] = {k: v.clone().to(parameter.device) for k, v in state.items()}
+        own = [key for key in tensors if key.startswith(prefix)]
+        if own:
+            optimiser.state[parameter] = {
+                key.removeprefix(prefix): tensors[key].clone().to(parameter.device) for key in own
+            }
     out.history, out.best_epoch = about["history"], about["best_epoch"]
     out.best, out.seconds = about["best"], about["seconds"]
     if all(f"best.{k}" in tensors for k in names):
-        best.keep({k: tensors[f"best.{k}"] for k in names})
+        best.keep(lambda name: tensors[f"best.{name}"])
 
 
 def _told(name: str, epochs: int, out: Fit, scale: float) -> Epoch:

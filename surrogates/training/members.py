@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,7 +25,7 @@ class _OfSeed:
     keeper: Keeper
     seed: int
 
-    def load(self, name: str) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
+    def load(self, name: str) -> tuple[Mapping[str, Tensor], dict[str, Any]] | None:
         return self.keeper.load(self._named(name))
 
     def due(self, epoch: int) -> bool:
