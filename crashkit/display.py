@@ -82,7 +82,7 @@ def in_notebook() -> bool:
 
 
 class NotebookLine:
-    """One line below a cell that is written anew: what is being done, how far it is, and a note."""
+    """One line below a cell that is written anew, and is empty once the cell is done: what is being done, how far it is, a note."""
 
     def __init__(self) -> None:
         self._shown: Any = None
@@ -98,8 +98,24 @@ class NotebookLine:
         line = HTML(progress_html(what, done, total, note))
         if self._shown is None:
             self._shown = display(line, display_id=True)
+            self._leave_with_the_cell()
         else:
             self._shown.update(line)
+
+    def _leave_with_the_cell(self) -> None:
+        """Empty the line when the cell ends: what was told last is seldom the end."""
+        if not in_notebook():
+            return
+        from IPython.display import HTML
+
+        events = sys.modules["IPython"].get_ipython().events
+
+        def leave(*_: object) -> None:
+            events.unregister("post_run_cell", leave)
+            self._shown.update(HTML(""))
+            self._shown = None
+
+        events.register("post_run_cell", leave)
 
 
 def progress_html(what: str, done: int, total: int, note: str) -> str:

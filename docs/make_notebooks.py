@@ -29,12 +29,17 @@ def kept(notebook: nbformat.NotebookNode, folder: Path) -> nbformat.NotebookNode
     for cell in notebook.cells:
         cell.metadata.pop("execution", None)
         if cell.cell_type == "code":
-            cell.outputs = [o for o in cell.outputs if o.get("name") != "stderr"]
+            cell.outputs = [o for o in cell.outputs if o.get("name") != "stderr" and not _is_empty(o)]
             for output in cell.outputs:
                 if "text" in output:
                     output.text = output.text.replace(f"{folder}/", "")
     notebook.metadata.pop("widgets", None)
     return notebook
+
+
+def _is_empty(output: nbformat.NotebookNode) -> bool:
+    """A line of progress that has left."""
+    return output.output_type == "display_data" and output.data.get("text/html") == ""
 
 
 def main() -> None:
