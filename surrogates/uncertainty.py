@@ -21,6 +21,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from data_schema.finite import all_finite
 from surrogates.errors import SurrogateError
 from surrogates.local_errors import LocalErrors
 
@@ -199,9 +200,8 @@ def living_mean(
     distance: NDArray[np.float32], axis: int, dtype: type[np.floating[Any]] | None = None
 ) -> NDArray[np.floating[Any]]:
     """The mean over what is there; where that is everything, without the copy that `nanmean` makes."""
-    if np.isnan(distance.sum()):
-        return np.asarray(np.nanmean(distance, axis=axis, dtype=dtype))
-    return np.asarray(distance.mean(axis=axis, dtype=dtype))
+    mean = np.mean if all_finite(distance) else np.nanmean
+    return np.asarray(mean(distance, axis=axis, dtype=dtype))
 
 
 def _product(

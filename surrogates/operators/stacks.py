@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from itertools import pairwise
 from typing import Any
 
@@ -116,21 +117,20 @@ def _add_product(weight: Tensor, a: Tensor, b: Tensor) -> None:
         weight.grad.addmm_(a, b)
 
 
-_in_place = False
+_in_place: ContextVar[bool] = ContextVar("gradients_in_place", default=False)
 
 
 @contextmanager
 def gradients_in_place() -> Iterator[None]:
-    """What is computed inside, on one thread, adds the gradients of large dense layers to their weights' own as it goes back.
+    """What this thread computes inside adds the gradients of large dense layers to their weights' own as it goes back.
 
     Only for `backward`: what asks for gradients in another way finds none.
     """
-    global _in_place
-    _in_place = True
+    before = _in_place.set(True)
     try:
         yield
     finally:
-        _in_place = False
+        _in_place.reset(before)
 
 
 class Convolutions(nn.Module):
@@ -192,7 +192,7 @@ class GraphEncoder(nn.Module):
             return functional.linear(h.transpose(0, 1).flatten(1), self.dense.weight, self.dense.bias)
         if _states_are_smaller(operator, self.dense.out_features, h.shape[1]):
             return applied(
-                _EncodeLarge if _in_place else _Encode,
+                _EncodeLarge if _in_place.get() else _Encode,
                 h.transpose(1, 2).reshape(-1, h.shape[1]),
                 self.dense.weight,
                 self.dense.bias,
@@ -224,7 +224,7 @@ class GraphDecoder(nn.Module):
             states: Tensor = self.convolutions(h.unflatten(1, (self.n_nodes, self.channels)).transpose(0, 1))
             return states
         if _states_are_smaller(operator, self.dense.in_features, len(z)):
-            h = applied(_DecodeLarge if _in_place else _Decode, z, weight, bias)
+            h = applied(_DecodeLarge if _in_place.get() else _Decode, z, weight, bias)
             x: Tensor = self.convolutions(h.view(self.n_nodes, self.channels, -1).transpose(1, 2))
             return _by_node(x)
         weight = weight.unflatten(0, (self.n_nodes, self.channels)).transpose(0, 1).flatten(0, 1)
