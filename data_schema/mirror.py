@@ -11,6 +11,16 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from scipy import sparse
 
+# What a parameter is that may be odd, for people.
+ODD = "one that changes its sign in the mirror has values on both sides of zero, or from zero on, such as an angle or an offset;"
+# An odd parameter comes at least this close to zero, as a share of its range.
+_NEAR_ZERO = 0.1
+
+
+def comes_near_zero(low: float, high: float) -> bool:
+    """Whether a parameter from `low` to `high` may be odd: else no mirrored run would come near a computed one."""
+    return max(low, -high) <= _NEAR_ZERO * (high - low)
+
 
 @dataclass(frozen=True)
 class MirrorPlane:

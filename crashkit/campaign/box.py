@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from crashkit.errors import CrashkitError
 from crashkit.yaml_file import checked, read_yaml
+from data_schema.mirror import ODD, comes_near_zero
 
 
 class CampaignError(CrashkitError):
@@ -39,11 +40,8 @@ class Range(BaseModel):
             raise ValueError(
                 f"low {self.low:g} and high {self.high:g} make no range; expected low < high (leave out what is not varied)"
             )
-        if self.odd and max(self.low, -self.high) > 0.1 * (self.high - self.low):
-            raise ValueError(
-                f"{self.low:g} to {self.high:g} is marked odd; what changes its sign in the mirror has values on both sides of "
-                "zero, or from zero on, such as an angle or an offset; leave odd out"
-            )
+        if self.odd and not comes_near_zero(self.low, self.high):
+            raise ValueError(f"{self.low:g} to {self.high:g} is marked odd; {ODD} leave odd out")
         return self
 
 

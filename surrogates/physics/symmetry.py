@@ -16,15 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from data_schema.mirror import MirrorPlane
+from data_schema.mirror import ODD, MirrorPlane, comes_near_zero
 from surrogates.errors import SurrogateError
 
 # States that are mirrored at once.
 _STATES = 16
 # Parameters that may be odd and are tried in all combinations.
 _TRIED = 3
-# An odd parameter comes at least this close to zero, as a share of its range.
-_NEAR_ZERO = 0.1
 
 
 @dataclass(frozen=True)
@@ -125,12 +123,11 @@ def check_odd(
             raise SurrogateError(f"physics.odd names {name!r}, which is no parameter; there are {', '.join(names)}")
         k = list(names).index(name)
         low, high = float(parameters[:, k].min()), float(parameters[:, k].max())
-        if max(low, -high) > _NEAR_ZERO * (high - low):
+        if not comes_near_zero(low, high):
             unit, factor = written[k] if written else ("", 1.0)
             raise SurrogateError(
                 f"physics.odd names {name}, which is {low / factor:.4g} to {high / factor:.4g} {unit}".rstrip()
-                + " in these runs; one that changes its sign in the mirror has values on both sides of zero, or from zero on, such as an "
-                "angle or an offset; leave it out of --odd"
+                + f" in these runs; {ODD} leave it out of --odd"
             )
 
 
