@@ -79,15 +79,21 @@ def _dots(
     ]
 
 
+# Room for a digit, and for " mm" with what lies around a label, in the drawing's font of 11 pixels.
+_DIGIT, _UNIT = 7.5, 36.0
+
+
 def _curve(rounds: list[dict[str, Any]], target: float | None) -> dict[str, Any] | None:
     """Error over runs with its interval, as points of a drawing 480 x 220; lengths in mm, logarithmic."""
     known = [r for r in rounds if r.get("error_m")]
     if not known:
         return None
-    width, height, left, bottom = 480.0, 220.0, 52.0, 26.0
     values = [v for r in known for v in (r["low_m"], r["high_m"], r["error_m"])] + ([target] if target else [])
     first, last = min(values) * 0.9e3, max(values) * 1.1e3
     most = max(r["runs"] for r in known)
+    ticks = [(float(v), f"{v:.3g}") for v in np.geomspace(first, last, 4)]
+    width, height, bottom = 480.0, 220.0, 26.0
+    left = _UNIT + _DIGIT * max(len(text) for _, text in ticks)
 
     def place(runs: float, value: float) -> tuple[float, float]:
         up = np.log(value * 1e3 / first) / np.log(last / first)
@@ -104,6 +110,6 @@ def _curve(rounds: list[dict[str, Any]], target: float | None) -> dict[str, Any]
             for r in known
         ],
         "target": None if target is None else place(0, target)[1],
-        "ticks": [(f"{v:.3g}", place(0, v / 1e3)[1]) for v in np.geomspace(first, last, 4)],
+        "ticks": [(text, place(0, v / 1e3)[1]) for v, text in ticks],
         "last": most,
     }  # fmt: skip

@@ -14,6 +14,7 @@ import crashkit
 from crashkit.api.propose import propose
 from crashkit.api.run_campaign import run_campaign
 from crashkit.campaign.box import CampaignError
+from crashkit.campaign.status import _curve
 from crashkit.campaign.table import Table
 from crashkit.cli import app
 
@@ -51,6 +52,16 @@ def test_rounds_go_from_the_first_runs_to_the_limit_and_the_error_falls(finished
     assert rounds[1]["error_m"] < rounds[0]["error_m"]
     assert {r.origin for r in runs} == {"start", "proposed"}
     assert crashkit.open_dataset(finished / "crash.zarr").sizes["sim"] == 12
+
+
+@pytest.mark.parametrize("size", [1e-4, 1e-3, 0.1, 5.0])
+def test_labels_of_the_error_have_room_beside_the_axis(size: float) -> None:
+    rounds = [{"runs": 8, "error_m": size, "low_m": 0.8 * size, "high_m": 1.3 * size}]
+    curve = _curve(rounds, None)
+    assert curve is not None
+    longest = max(len(text) for text, _ in curve["ticks"])
+    # In a wide font a digit is 0.64 of 11 pixels, " mm" 25 pixels; labels end 6 pixels before the axis.
+    assert 0.64 * 11 * longest + 25 <= curve["left"] - 6
 
 
 def test_the_status_is_told_in_the_terminal_and_on_a_page(finished: Path) -> None:
