@@ -151,6 +151,8 @@ def _client(workers: int, scheduler: str | None, patience: float) -> Iterator[An
                     memory_limit=0, silence_logs=logging.CRITICAL,
                 )  # fmt: skip
                 address: Any = stack.enter_context(cluster)
+                # Of lines that break as workers go it tells at times once the cluster, and its silence, have ended.
+                logging.getLogger("distributed.batched").setLevel(logging.CRITICAL)
                 stack.push(_ends_at_once([child for child in active_children() if child not in before]))
         else:
             address = scheduler
