@@ -31,8 +31,8 @@ from crashkit.dataset import open_dataset
 from crashkit.selection import runs_of
 from surrogates.data.campaign import Campaign, CoarseRuns, RunByRun
 from surrogates.data.samples import LevelRuns, Notes
-from surrogates.models.coarse_fit import ALONE
 from surrogates.models.pod_regression import PodFit, fit_pod_regression, from_coarse_run, with_coarse
+from surrogates.regression.beneath import ALONE
 from surrogates.settings import Settings
 from surrogates.settings import settings as all_settings
 

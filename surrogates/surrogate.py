@@ -16,10 +16,12 @@ from surrogates.data.graphs import Graphs
 from surrogates.data.inputs import over_range
 from surrogates.errors import SurrogateError
 from surrogates.local_errors import HARD, LocalErrors
+from surrogates.models.coarse_base import CoarseMesh
 from surrogates.models.curves import Curve
 from surrogates.models.element_field import ElementField, faces_to_level
 from surrogates.models.pod_regression import PodRegression, from_coarse_run
 from surrogates.models.removal import Removal
+from surrogates.physics.clock import between
 from surrogates.physics.registration import Registration
 from surrogates.record import Fit, Record
 from surrogates.settings import Settings
@@ -65,8 +67,10 @@ class Surrogate:
         How likely elements are gone; None where none was ever removed.
     fields
         Results on elements that were learnt beside the displacements, by name.
-    run_band
-        The band of predictions that start from a coarse run of the query; None where there is none.
+    run_bands
+        As `bands`, of predictions that start from a coarse run of the query.
+    mesh_below
+        The mesh of the coarse runs beneath a network's levels; None without any.
     """
 
     def __init__(
@@ -84,7 +88,8 @@ class Surrogate:
         self.labels: Labels | None = None
         self.registration = registration or Registration.identity(record.ranges.names, record.time)
         self.bands: dict[tuple[int, bool], Band] = {}
-        self.run_band: Band | None = None
+        self.run_bands: dict[tuple[int, bool], Band] = {}
+        self.mesh_below: CoarseMesh | None = None
         self.removal: Removal | None = None
         self.fields: dict[str, ElementField] = {}
         self.curves: dict[str, Curve] = {}
@@ -144,33 +149,90 @@ class Surrogate:
         )
         return out[0] if np.ndim(parameters) == 1 else out
 
+    @property
+    def coarse_mesh(self) -> CoarseMesh | None:
+        """The mesh of the coarse runs that a prediction can start from; None where the model takes nothing from any."""
+        if isinstance(self.core, PodRegression):
+            return None if self.core.base is None else self.core.base.mesh
+        core = self.core
+        return self.mesh_below if any(core.takes_coarse(k) for k in core.numbers) else None
+
+    def takes_coarse(self, level: int | None = None) -> bool:
+        """Whether predictions on `level` can start from a coarse run."""
+        if self.coarse_mesh is None:
+            return False
+        return isinstance(self.core, PodRegression) or self.core.takes_coarse(self.number(level))
+
+    def check_takes_coarse(self, level: int | None = None) -> None:
+        """Raise SurrogateError unless predictions on `level` can start from a coarse run, with the reason."""
+        if self.takes_coarse(level):
+            return
+        if self.coarse_mesh is None:
+            why = "those it was trained with did not pay" if self.record.coarse else "train mh or pod-gpr with --coarse"
+            raise SurrogateError(f"the model takes nothing from coarse runs: {why}")
+        taking = ", ".join(f"{name} (--level {k})" for name, k in self.level_names.items() if self.takes_coarse(k))
+        name = level_name(self.settings, self.number(level))
+        raise SurrogateError(
+            f"{name} takes nothing from coarse runs: those it was trained with did not pay there; ask for {taking}"
+        )
+
     def predict_from_coarse(
         self,
         parameters: ArrayLike,
         states: NDArray[np.float32],
         states_time: NDArray[np.float64],
         time: ArrayLike | None = None,
+        level: int | None = None,
+        *,
+        full: bool = False,
     ) -> NDArray[np.float32]:
-        """`predict` of one run from a run of the same parameters on the coarse mesh: (state, node, 3), m.
+        """`predict` of one run from a run of the same parameters on the coarse mesh: (state, node of `level`, 3), m.
 
         Parameters
         ----------
         states
             (state, coarse node, 3), m, in the order of the coarse runs the model was trained with, at `states_time`, s.
+        full
+            Lifted to the full mesh, as by `predict_full`.
 
         Raises
         ------
         SurrogateError
-            For a model without coarse runs, and as `predict`.
+            For a model or level without coarse runs, and as `predict`.
         """
-        core = self.core
+        core, mesh, number = self.core, self.coarse_mesh, self.number(level)
         values, times = self.checked(parameters, time)
-        if not isinstance(core, PodRegression) or core.base is None:
-            why = "" if not self.record.coarse else ": those it was trained with did not pay"
-            raise SurrogateError(f"the model takes nothing from coarse runs{why}; train pod-gpr with --coarse")
+        self.check_takes_coarse(number)
         if len(values) != 1:
             raise SurrogateError(f"one coarse run was given for parameters of {len(values)} runs")
-        return from_coarse_run(core, self.registration, values, states, states_time, times)
+        if isinstance(core, PodRegression):
+            return from_coarse_run(core, self.registration, values, states, states_time, times)
+        assert mesh is not None
+        kept = self.graphs.kept(number)
+        on_level = lift(mesh.to_fine[kept].astype(np.float32), np.asarray(states, np.float32))
+        z = self.encode(self.registration.on_grid(on_level, values[0], states_time), number)
+        out: NDArray[np.float32] = self.registration.undo(
+            lambda x, t: self._from_latents(x, t, number, z), values, times
+        )[0]
+        return self.lift(out, number) if full else out
+
+    def _from_latents(
+        self, inputs: NDArray[np.float64], time: NDArray[np.float64], number: int, z: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """(1, state, node, 3) of registered inputs (1, input) and times, from a coarse run's course (state of the grid, latent)."""
+        import torch
+
+        core, some = self.core, _chunk(self.graphs.n_nodes(number))
+        assert not isinstance(core, PodRegression)
+        grid = self.record.time if self.registration.is_identity else self.registration.grid
+        at = torch.from_numpy(np.repeat(inputs, len(time), axis=0))
+        given = (at, torch.from_numpy(time), torch.from_numpy(between(z, grid, time)))
+        with torch.no_grad():
+            parts = [
+                core.from_coarse(a, t, number, seen).transpose(0, 1)
+                for a, t, seen in zip(*(of.split(some) for of in given), strict=True)
+            ]
+        return np.ascontiguousarray(torch.cat(parts).numpy())[None]
 
     def predict_nodes(
         self, parameters: ArrayLike, nodes: NDArray[np.int64], time: ArrayLike | None = None, level: int | None = None
@@ -327,7 +389,7 @@ class Surrogate:
             Where there were too few runs.
         """
         number = self.number(level)
-        found = self.run_band if from_coarse else self.bands.get((number, full and number > 0))
+        found = (self.run_bands if from_coarse else self.bands).get((number, full and number > 0))
         if found is None:
             raise SurrogateError(
                 f"there is no band for {level_name(self.settings, number)}: too few runs to judge it by; see the model card"

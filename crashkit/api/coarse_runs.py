@@ -100,7 +100,7 @@ def coarse_runs(given: str | Path | xr.Dataset, campaign: Campaign, source: Sour
 
 
 def coarse_run_states(
-    given: str | Path | xr.Dataset, surrogate: Surrogate, parameters: NDArray[np.float64]
+    given: str | Path | xr.Dataset, surrogate: Surrogate, parameters: NDArray[np.float64], level: int | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
     """Displacements (state, coarse node, 3), m, and times (state,), s, of one coarse run, in the order of the model's coarse mesh.
 
@@ -110,6 +110,8 @@ def coarse_run_states(
         A folder or file of a solver, a run of a dataset (`coarse.zarr:run_012`), a dataset of one run, or one in hand.
     parameters
         (parameter,) of the run, in the model's units: those that the run itself states must be the same.
+    level
+        On which the prediction is wanted; it must take something from coarse runs; default: the finest.
 
     Raises
     ------
@@ -119,24 +121,26 @@ def coarse_run_states(
     import numpy as np
 
     from crashkit.errors import DataError
-    from surrogates.models.pod_regression import PodRegression
+    from surrogates.errors import SurrogateError
 
-    core = surrogate.core
-    if not isinstance(core, PodRegression) or core.base is None:
-        why = "those it was trained with did not pay" if surrogate.record.coarse else "train pod-gpr with --coarse"
-        raise DataError(f"the model takes nothing from coarse runs: {why}")
+    try:
+        surrogate.check_takes_coarse(level)
+    except SurrogateError as error:
+        raise DataError(str(error)) from error
+    mesh = surrogate.coarse_mesh
+    assert mesh is not None
     with _opened(given, str(surrogate.record.coarse.get("units", ""))) as (name, run):
         place = {int(number): k for k, number in enumerate(run["node_id"].values)}
-        missing = [int(number) for number in core.base.node_id if int(number) not in place]
+        missing = [int(number) for number in mesh.node_id if int(number) not in place]
         if missing:
             raise DataError(
                 f"{name}: has {run.sizes['node']} nodes and not node {missing[0]}; expected the coarse mesh of "
-                f"{len(core.base.node_id)} nodes that the model was trained with"
+                f"{len(mesh.node_id)} nodes that the model was trained with"
             )
-        rows = np.array([place[int(number)] for number in core.base.node_id])
+        rows = np.array([place[int(number)] for number in mesh.node_id])
         at = run["reference_position"].values[rows]
-        apart = float(np.linalg.norm(at - core.base.position, axis=1).max())
-        size = float(np.linalg.norm(np.ptp(core.base.position, axis=0)))
+        apart = float(np.linalg.norm(at - mesh.position, axis=1).max())
+        size = float(np.linalg.norm(np.ptp(mesh.position, axis=0)))
         if not apart <= _SAME_PLACE * size:
             raise DataError(
                 f"{name}: a node lies {1e3 * apart:.3g} mm from its place in the coarse mesh the model was trained with; "

@@ -142,9 +142,8 @@ class Model:
             if coarse_run is not None:
                 from crashkit.api.coarse_runs import coarse_run_states
 
-                u = surrogate.predict_from_coarse(values, *coarse_run_states(coarse_run, surrogate, values[0]), at)[
-                    None
-                ]
+                seen = coarse_run_states(coarse_run, surrogate, values[0], number)
+                u = surrogate.predict_from_coarse(values, *seen, at, number, full=full)[None]
             else:
                 u = surrogate.predict_full(values, at, number) if full else surrogate.predict(values, at, number)
         if not all_finite(u):

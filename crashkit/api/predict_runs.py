@@ -359,7 +359,7 @@ def _band(prediction: xr.Dataset, share: float, model: Model, from_coarse: bool 
     width, surrogate = prediction["half_width"].values, model.surrogate
     name, full = str(prediction.attrs["model"]), prediction.attrs["level"] == 0
     number = surrogate.level_names[name]
-    behind = surrogate.run_band if from_coarse else surrogate.bands[number, full and number > 0]
+    behind = (surrogate.run_bands if from_coarse else surrogate.bands)[number, full and number > 0]
     inside = None
     if "error" in prediction:
         error = prediction["error"].values
@@ -370,7 +370,7 @@ def _band(prediction: xr.Dataset, share: float, model: Model, from_coarse: bool 
         share=share,
         mean_half_width_m=float(np.nanmean(width)),
         largest_half_width_m=float(np.nanmax(width)),
-        runs_behind=behind.runs if behind is not None else 0,
+        runs_behind=behind.runs,
         inside=inside,
         on_test_runs=None if held is None else held.told,
     )

@@ -78,7 +78,7 @@ def train(
     targets
         What is learnt beside the displacements: "history:wall_force", a channel, a pattern, or the name of a resultant.
     coarse
-        Dataset of runs of the same structure on a coarser mesh, which help where fine runs are few (pod-gpr). Parts are
+        Dataset of runs of the same structure on a coarser mesh, which help where fine runs are few (mh, pod-gpr). Parts are
         matched by name or number, parameters by name. Folds over the fine runs decide whether they are used.
     hierarchy
         Mesh hierarchy of a dataset in memory, as `crashkit.coarsen(dataset)` returns it. A dataset on disk has its own.
@@ -138,8 +138,10 @@ def train(
         check_model_folder(folder, overwrite)
     elif resume:
         raise SurrogateError("resume goes on with a training beside its model folder; give output")
-    if coarse is not None and chosen.model != "pod-gpr":
-        raise SurrogateError(f"coarse runs go beneath pod-gpr, and the model is {chosen.model}; train pod-gpr")
+    if coarse is not None:
+        from surrogates.training.coarse import check_coarse_settings
+
+        check_coarse_settings(chosen)
     for given_path in (dataset, coarse):
         if isinstance(given_path, (str, Path)):
             require_dataset(given_path)

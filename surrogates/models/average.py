@@ -49,6 +49,13 @@ class Average(Network):
     def forward(self, parameters: Tensor, time: Tensor, number: int) -> Tensor:
         return _mean([member(parameters, time, number) for member in self.networks])
 
+    def from_coarse(self, parameters: Tensor, time: Tensor, number: int, seen: Tensor) -> Tensor:
+        parts = seen.split([member.latent(number) for member in self.networks], dim=1)
+        return _mean([m.from_coarse(parameters, time, number, z) for m, z in zip(self.networks, parts, strict=True)])
+
+    def takes_coarse(self, number: int) -> bool:
+        return any(member.takes_coarse(number) for member in self.networks)
+
     def encode_metres(self, x: Tensor, number: int) -> Tensor:
         """The latent vectors of the members side by side."""
         return torch.cat([member.encode_metres(x, number) for member in self.networks], dim=1)

@@ -39,6 +39,14 @@ class Network(nn.Module):
         """Displacements of level `number` for parameters (b, p) and time (b,), s."""
         raise NotImplementedError
 
+    def from_coarse(self, parameters: Tensor, time: Tensor, number: int, seen: Tensor) -> Tensor:
+        """As `forward`, from a coarse run of the query: `seen` (b, latent) is what it encodes as on the level."""
+        raise NotImplementedError
+
+    def takes_coarse(self, number: int) -> bool:
+        """Whether level `number` takes anything from a coarse run of the query."""
+        return False
+
     def encode_metres(self, x: Tensor, number: int) -> Tensor:
         """States of level `number`, m -> latent vectors (b, latent)."""
         raise NotImplementedError

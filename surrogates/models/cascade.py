@@ -52,6 +52,14 @@ class Cascade(Network):
         level = self.levels[number]
         return in_metres(level.decode(level.regress(self.inputs(parameters, time))), level.scale)
 
+    def from_coarse(self, parameters: Tensor, time: Tensor, number: int, seen: Tensor) -> Tensor:
+        level, inputs = self.levels[number], self.inputs(parameters, time)
+        return in_metres(level.decode(level.regress(inputs) + level.from_query(inputs, seen)), level.scale)
+
+    def takes_coarse(self, number: int) -> bool:
+        process = self.levels[number].process
+        return process is not None and process.over is not None
+
     def encode_metres(self, x: Tensor, number: int) -> Tensor:
         level = self.levels[number]
         return level.encode(x / level.scale)

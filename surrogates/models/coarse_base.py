@@ -16,7 +16,55 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from surrogates.data.campaign import CoarseRuns
+from surrogates.errors import SurrogateError
 from surrogates.regression.gaussian import Gaussian
+
+
+@dataclass(frozen=True)
+class CoarseMesh:
+    """The mesh of coarse runs: a coarse run that a prediction starts from must be on it.
+
+    Attributes
+    ----------
+    to_fine
+        (node of the full mesh, coarse node): what a coarse field says at each node.
+    position, node_id
+        (coarse node, 3), m, and the solver's numbers on it.
+    """
+
+    to_fine: sparse.csr_matrix
+    position: NDArray[np.float64]
+    node_id: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, coarse: CoarseRuns) -> CoarseMesh:
+        """That of `coarse`; nodes are numbered 1, 2, .. without the solver's numbers.
+
+        Raises
+        ------
+        SurrogateError
+            For runs without a mesh.
+        """
+        campaign = coarse.campaign
+        if campaign.points is None:
+            raise SurrogateError("coarse runs need their mesh, to tell later whether a coarse run is on it")
+        numbers = np.arange(1, campaign.n_nodes + 1) if campaign.labels is None else campaign.labels.node_id
+        return cls(coarse.to_fine, campaign.points, numbers)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """What has to be stored."""
+        u = self.to_fine
+        return {
+            "data": u.data, "indices": u.indices.astype(np.int32), "indptr": u.indptr.astype(np.int64),
+            "position": self.position, "node_id": self.node_id,
+        }  # fmt: skip
+
+    @classmethod
+    def load(cls, a: Mapping[str, NDArray[Any]]) -> CoarseMesh:
+        """From what `arrays` gave."""
+        shape = (len(a["indptr"]) - 1, len(a["position"]))
+        return cls(sparse.csr_matrix((a["data"], a["indices"], a["indptr"]), shape=shape), a["position"], a["node_id"])
 
 
 @dataclass
@@ -31,10 +79,8 @@ class CoarseBase:
         (coarse run and image, state of the grid, mode), m: registered courses times the slopes.
     slopes
         (mode,) how much of the coarse field is taken over.
-    to_fine
-        (node of the full mesh, coarse node): what a coarse field says at each node.
-    position, node_id
-        The coarse mesh (coarse node, 3), m, and the solver's numbers on it: a coarse run must have them.
+    mesh
+        That of the coarse runs.
     share
         How much a coarse run of the query counts; the process counts by the rest.
     beside
@@ -54,42 +100,36 @@ class CoarseBase:
     process: Gaussian
     values: NDArray[np.float32]
     slopes: NDArray[np.float64]
-    to_fine: sparse.csr_matrix
-    position: NDArray[np.float64]
-    node_id: NDArray[np.int64]
+    mesh: CoarseMesh
     share: float = 1.0
     beside: tuple[Gaussian, NDArray[np.float32]] | None = None
 
     def project(self, states: NDArray[np.float32], modes: NDArray[np.float32]) -> NDArray[np.float64]:
         """Coarse displacements (state, coarse node, 3), m -> what is taken over of their coefficients (state, mode)."""
-        return np.asarray((states.reshape(len(states), -1) @ coarse_modes(self.to_fine, modes)) * self.slopes)
+        return np.asarray((states.reshape(len(states), -1) @ coarse_modes(self.mesh.to_fine, modes)) * self.slopes)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """What has to be stored."""
-        u = self.to_fine
         beside: dict[str, NDArray[Any]] = {}
         if self.beside is not None:
             machine, values = self.beside
             numbers = machine.numbers()
             beside = {"beside.x": machine.x, "beside.values": values, **{f"beside.{k}": v for k, v in numbers.items()}}
-        return beside | {
+        return beside | self.mesh.arrays() | {
             "x": self.process.x, **self.process.numbers(), "values": self.values, "slopes": self.slopes,
-            "data": u.data, "indices": u.indices.astype(np.int32), "indptr": u.indptr.astype(np.int64),
-            "position": self.position, "node_id": self.node_id, "share": np.array([self.share]),
+            "share": np.array([self.share]),
         }  # fmt: skip
 
     @classmethod
     def load(cls, a: Mapping[str, NDArray[Any]]) -> CoarseBase:
         """From what `arrays` gave."""
-        shape = (len(a["indptr"]) - 1, len(a["position"]))
-        to_fine = sparse.csr_matrix((a["data"], a["indices"], a["indptr"]), shape=shape)
         process = Gaussian.load(a["x"], a)
         beside = None
         if "beside.x" in a:
             numbers = {k: a[f"beside.{k}"] for k in process.numbers()}
             beside = Gaussian.load(a["beside.x"], numbers), a["beside.values"]
         share = float(a["share"][0])
-        return cls(process, a["values"], a["slopes"], to_fine, a["position"], a["node_id"], share, beside)
+        return cls(process, a["values"], a["slopes"], CoarseMesh.load(a), share, beside)
 
 
 def coarse_modes(to_fine: sparse.csr_matrix, modes: NDArray[np.float32]) -> NDArray[np.float32]:

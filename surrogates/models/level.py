@@ -161,6 +161,14 @@ class LevelNetwork(nn.Module):
         z = self.regressor(inputs, below, course)
         return z if self.process is None else torch.lerp(z, self.process(known_inputs), self.process.share)
 
+    def from_query(self, inputs: Tensor, seen: Tensor) -> Tensor:
+        """What a coarse run of the query, encoded as `seen` (b, latent), changes of `regress`: (b, latent)."""
+        process = self.process
+        if process is None or process.over is None:
+            return torch.zeros_like(seen)
+        changed: Tensor = process.share * process.over.from_query(inputs, seen)
+        return changed
+
     def encoded_initial(self, inputs: Tensor, initial: Tensor | None) -> Tensor:
         """z0 (b, latent): the encoded first state of each sample's run."""
         encoded = self.encode(inputs.new_zeros(self.n_nodes, 1, 3) if initial is None else initial)

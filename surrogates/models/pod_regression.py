@@ -24,7 +24,6 @@ from surrogates.errors import SurrogateError
 from surrogates.models.coarse_base import CoarseBase
 from surrogates.models.coarse_fit import CoarseFit, fit_coarse
 from surrogates.physics.choice import Worth, choose, not_used
-from surrogates.physics.clock import between
 from surrogates.physics.registration import Registration
 from surrogates.physics.trials import Courses, Folds, Trials, courses_of, one_thread
 from surrogates.physics.weigher import Machine
@@ -306,10 +305,7 @@ def from_coarse_run(
 ) -> NDArray[np.float32]:
     """(state, node, 3), m, at `time` of one run with parameters (1, parameter), from its states (state, coarse node, 3), m."""
     assert core.base is not None
-    seen, clock, grid = core.base.project(states, core.modes), registration.clock, registration.grid
-    course = (
-        between(seen, states_time, grid) if clock.is_identity else clock.apply(seen, parameters[0], states_time, grid)
-    )
+    course = registration.on_grid(core.base.project(states, core.modes), parameters[0], states_time)
     out: NDArray[np.float32] = registration.undo(
         lambda x, t: core.displacement(x, t, coarse=course[None]), parameters, time
     )[0]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from surrogates.data.campaign import Campaign, RunByRun
 from surrogates.data.samples import LevelRuns, Notes, ValidationSplit
 from surrogates.data.shelf import Shelf
-from surrogates.physics.clock import Clock
+from surrogates.physics.clock import Clock, between
 from surrogates.physics.derived import DerivedInputs
 from surrogates.physics.symmetry import Symmetry
 from surrogates.settings import Settings
@@ -96,6 +96,15 @@ class Registration:
     def read(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
         """Inputs (run, input) of a model for parameters (run, parameter) of runs as computed."""
         return self._inputs(np.atleast_2d(parameters), len(np.atleast_2d(parameters)))
+
+    def on_grid(self, states: NDArray[Any], parameters: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[Any]:
+        """States (state, ..) at `time` of a run with parameters (parameter,), registered, at the states of the grid.
+
+        Unlike runs that are learnt, it may have other times where the clock is each run's own.
+        """
+        if self.clock.is_identity:
+            return between(states, time, self.grid)
+        return self.clock.apply(states, parameters, time, self.grid)
 
     def undo(
         self,

@@ -39,6 +39,8 @@ class LatentProcess(nn.Module):
         (state, latent) mean course, and `pull` (run, state, latent) what each run adds to it.
     numbers
         Variance, variance of the linear trend, noise; `mix` (parameter, parameter), see `gaussian.Kernel`.
+    over
+        What coarse runs add; None without. Then `mean` and `pull` are of what they leave to the fine ones.
     """
 
     runs: Tensor
@@ -61,8 +63,14 @@ class LatentProcess(nn.Module):
             ("share", ()),
         ):
             self.register_buffer(name, torch.zeros(shape))
+        self.over: OverCoarse | None = None
 
     def forward(self, inputs: Tensor) -> Tensor:
+        own = self.of_runs(inputs)
+        return own if self.over is None else own + self.over(inputs)
+
+    def of_runs(self, inputs: Tensor) -> Tensor:
+        """What its own runs say."""
         place, parts = self._stencil(inputs[:, self.runs.shape[1]])
         parameters = inputs[:, : self.runs.shape[1]]
         one_run = _alike(parameters)
@@ -107,7 +115,50 @@ class LatentProcess(nn.Module):
     def like(cls, tensors: Mapping[str, Tensor]) -> LatentProcess:
         """An empty one with room for stored `tensors`."""
         runs, states, latent = tensors["pull"].shape
-        return cls(runs, tensors["runs"].shape[1], states, latent)
+        out = cls(runs, tensors["runs"].shape[1], states, latent)
+        if "over.slopes" in tensors:
+            of = {name: _under(tensors, f"over.{name}.") for name in ("below", "beside")}
+            beside = cls.like(of["beside"]) if of["beside"] else None
+            out.over = OverCoarse(cls.like(of["below"]), beside, torch.zeros_like(tensors["over.slopes"]))
+        return out
+
+
+class OverCoarse(nn.Module):
+    """What coarse runs add to a process of fine ones.
+
+    Attributes
+    ----------
+    below
+        Over the coarse runs, their slopes in it.
+    beside
+        A second process over the fine runs, with other lengths; None without.
+    slopes
+        (latent, latent): z of a coarse run -> what is taken over of it.
+    query
+        How much a coarse run of the query counts; `below` counts by the rest.
+    """
+
+    slopes: Tensor
+    query: Tensor
+
+    def __init__(self, below: LatentProcess, beside: LatentProcess | None, slopes: Tensor, query: float = 0.0) -> None:
+        super().__init__()
+        self.below, self.beside = below, beside
+        self.register_buffer("slopes", slopes)
+        self.register_buffer("query", torch.tensor(float(query)))
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        below: Tensor = self.below(inputs)
+        return below if self.beside is None else below + self.beside(inputs)
+
+    def from_query(self, inputs: Tensor, z: Tensor) -> Tensor:
+        """What a coarse run of the query, encoded as z (b, latent), changes of the answer: (b, latent)."""
+        out: Tensor = self.query * (z @ self.slopes.T - self.below(inputs))
+        return out
+
+
+def _under(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
 
 
 def _alike(rows: Tensor) -> bool:
@@ -137,7 +188,13 @@ def fit_process(
         Parameters whose lengths form a full matrix, see `gaussian.Gaussian`.
     """
     machine = Gaussian(runs, mixed=mixed).fit((courses * sizes).reshape(len(runs), -1), seed)
-    mean, pull = machine.expanded(courses.reshape(len(runs), -1))
+    return process_of(machine, time, courses)
+
+
+def process_of(machine: Gaussian, time: NDArray[np.float64], courses: NDArray[np.floating]) -> LatentProcess:
+    """A fitted process of the courses (run, state, latent) at the scaled times (state,), in torch."""
+    runs = machine.x
+    mean, pull = machine.expanded(courses.reshape(len(runs), -1).astype(np.float64))
     kernel = machine.kernel
     out = LatentProcess(len(runs), runs.shape[1], len(time), courses.shape[2])
     named = {

@@ -16,7 +16,7 @@ from scipy import sparse
 from surrogates.data.campaign import Labels
 from surrogates.data.graphs import Graphs
 from surrogates.errors import SurrogateError
-from surrogates.models.coarse_base import CoarseBase
+from surrogates.models.coarse_base import CoarseBase, CoarseMesh
 from surrogates.models.curves import Curve
 from surrogates.models.element_field import ElementField
 from surrogates.models.pod_regression import PodRegression
@@ -199,11 +199,16 @@ def check_base(base: CoarseBase | None, graphs: Graphs) -> None:
     if base.beside is not None:
         fine = len(numbers("inputs beside the coarse runs", base.beside[0].x, (None, None)))
         numbers("values beside the coarse runs", base.beside[1], (fine, base.values.shape[1], len(slopes)))
-    nodes = len(numbers("position of the coarse mesh", base.position, (None, 3)))
-    numbers("node_id of the coarse mesh", base.node_id, (nodes,))
-    whole_matrix("the map from the coarse mesh", base.to_fine)
-    if base.to_fine.shape[0] != graphs.n_full:
-        raise SurrogateError(f"the map from the coarse mesh has {base.to_fine.shape[0]} rows; expected {graphs.n_full}")
+    check_coarse_mesh(base.mesh, graphs)
+
+
+def check_coarse_mesh(mesh: CoarseMesh, graphs: Graphs) -> None:
+    """Places and numbers of the coarse nodes, and the map to each node of the full mesh."""
+    nodes = len(numbers("position of the coarse mesh", mesh.position, (None, 3)))
+    numbers("node_id of the coarse mesh", mesh.node_id, (nodes,))
+    whole_matrix("the map from the coarse mesh", mesh.to_fine)
+    if mesh.to_fine.shape[0] != graphs.n_full:
+        raise SurrogateError(f"the map from the coarse mesh has {mesh.to_fine.shape[0]} rows; expected {graphs.n_full}")
 
 
 def check_elements(removal: Removal | None, fields: Mapping[str, ElementField], n_faces: int, states: int) -> None:

@@ -5,7 +5,7 @@
                            several trainings, seed_0.level_3.safetensors .. of each
     graphs.safetensors     the levels' graphs and maps, and the full mesh, so that it lifts and draws without the data
     elements.safetensors   what is said of elements: their removal, plastic strain and the like; where there is any
-    coarse.safetensors     what coarse runs add to a POD regression, where there is any
+    coarse.safetensors     what coarse runs add to a POD regression, or the mesh of those beneath a cascade, where there are any
     bands.safetensors      how far predictions may be wrong, from the validation runs
     curves.safetensors     time histories, where they were learnt
     history.json           losses by epoch and level
@@ -35,7 +35,7 @@ from surrogates.data.campaign import Labels
 from surrogates.data.graphs import Graphs
 from surrogates.errors import ModelFolderError, SurrogateError
 from surrogates.local_errors import LocalErrors
-from surrogates.models.coarse_base import CoarseBase
+from surrogates.models.coarse_base import CoarseBase, CoarseMesh
 from surrogates.models.curves import Curve
 from surrogates.models.element_field import ElementField
 from surrogates.models.pod_regression import PodRegression
@@ -47,6 +47,7 @@ from surrogates.storage.card import card
 from surrogates.storage.checks import (
     check_bands,
     check_base,
+    check_coarse_mesh,
     check_core,
     check_curves,
     check_elements,
@@ -69,7 +70,7 @@ _ELEMENTS = "elements.safetensors"
 _SPREADS: tuple[Spread, ...] = ("constant", "size", "deviation", "local")
 _CURVES = "curves.safetensors"
 _COARSE = "coarse.safetensors"
-_OF_RUNS = "0.run."
+_OF_RUNS = ("run", "run_full")
 _LABELS = ("node_id", "face_part", "part_id", "face_id")
 
 
@@ -120,13 +121,17 @@ def load(folder: str | Path) -> Surrogate:
         graphs, points, faces = _graphs(stored)
         check_record(record)
         check_graphs(graphs, points, faces)
-        base = CoarseBase.load(load_file(folder / _COARSE)) if _COARSE in files else None
+        of_coarse = load_file(folder / _COARSE) if _COARSE in files else {}
+        base = CoarseBase.load(of_coarse) if "slopes" in of_coarse else None
         check_base(base, graphs)
+        mesh_below = CoarseMesh.load(of_coarse) if of_coarse and base is None else None
+        if mesh_below is not None:
+            check_coarse_mesh(mesh_below, graphs)
         core = _core(folder, about, settings, record, graphs, base)
         registration = Registration.from_dict(about["registration"])
         stored_bands = load_file(folder / "bands.safetensors")
-        bands = _bands({k: v for k, v in stored_bands.items() if not k.startswith(_OF_RUNS)}, record)
-        of_runs = _bands({k: v for k, v in stored_bands.items() if k.startswith(_OF_RUNS)}, record)
+        bands = _bands({k: v for k, v in stored_bands.items() if k.split(".")[1] not in _OF_RUNS}, record)
+        of_runs = _bands({k: v for k, v in stored_bands.items() if k.split(".")[1] in _OF_RUNS}, record)
         check_bands(of_runs, graphs, record)
         labels = _labels(stored, about)
         check_bands(bands, graphs, record)
@@ -146,7 +151,7 @@ def load(folder: str | Path) -> Surrogate:
         said = " ".join(str(error).split())[:200] or type(error).__name__
         raise ModelFolderError(f"{folder}: does not hold together ({said}); train it again") from error
     surrogate.bands = bands
-    surrogate.run_band = next(iter(of_runs.values()), None)
+    surrogate.run_bands, surrogate.mesh_below = of_runs, mesh_below
     surrogate.labels = labels
     surrogate.removal, surrogate.fields = elements
     surrogate.curves = curves
@@ -180,12 +185,14 @@ def _write(surrogate: Surrogate, folder: Path) -> None:
     if isinstance(core, PodRegression):
         save_file(core.arrays(), folder / "pod.safetensors")
         if core.base is not None:
-            save_file({k: np.ascontiguousarray(v) for k, v in core.base.arrays().items()}, folder / _COARSE)
+            save_file(_contiguous(core.base.arrays()), folder / _COARSE)
     else:
         from safetensors.torch import save_file as save_tensors
 
         for stem, tensors in core.tensors().items():
             save_tensors({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, folder / f"{stem}.safetensors")
+        if surrogate.coarse_mesh is not None:
+            save_file(_contiguous(surrogate.coarse_mesh.arrays()), folder / _COARSE)
     save_file(_graph_arrays(surrogate), folder / "graphs.safetensors")
     save_file(_band_arrays(surrogate), folder / "bands.safetensors")
     if surrogate.removal is not None or surrogate.fields:
@@ -375,8 +382,7 @@ def _curves(stored: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> dic
 def _band_arrays(surrogate: Surrogate) -> dict[str, NDArray[Any]]:
     out: dict[str, NDArray[Any]] = {}
     bands = {f"{number}.{'full' if lifted else 'own'}.": band for (number, lifted), band in surrogate.bands.items()}
-    if surrogate.run_band is not None:
-        bands[_OF_RUNS] = surrogate.run_band
+    bands |= {f"{number}.{_OF_RUNS[lifted]}.": band for (number, lifted), band in surrogate.run_bands.items()}
     for prefix, band in bands.items():
         arrays: dict[str, NDArray[Any]] = {"node": band.node, "state": band.state, "factor": band.factor}
         if band.local is not None:
@@ -402,7 +408,7 @@ def _bands(stored: Mapping[str, NDArray[Any]], record: Record) -> dict[tuple[int
             if spread == "local":
                 a = {n: stored[f"{number}.{where}.{n}"] for n in ("points", "ratio", "run", "width")}
                 local = LocalErrors(a["points"], a["ratio"], a["run"], float(a["width"][0]))
-            out[int(number), where == "full"] = Band(
+            out[int(number), where.endswith("full")] = Band(
                 **parts, time=record.time, runs=runs, spread=spread, unit=unit, local=local
             )
     return out
@@ -444,6 +450,10 @@ def _elements(
         for name, known in about.get("fields", {}).items()
     }
     return removal, fields
+
+
+def _contiguous(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    return {name: np.ascontiguousarray(values) for name, values in arrays.items()}
 
 
 def _plain(value: Any) -> Any:

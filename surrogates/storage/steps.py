@@ -23,6 +23,7 @@ from surrogates.operators.convolutions import ChebConv
 from surrogates.operators.stacks import GraphDecoder
 from surrogates.operators.upsampling import Upsampling
 from surrogates.reductions.reduction import DenseReduction, GraphReduction, LinearReduction, Reduction, SumReduction
+from surrogates.regression.latent_process import LatentProcess
 
 _ACTIVATIONS: Mapping[type[nn.Module], str] = {nn.ELU: "elu", nn.SiLU: "silu", nn.Tanh: "tanh", nn.GELU: "gelu"}
 
@@ -199,6 +200,14 @@ class _Writer:
     def process(self, level: LevelNetwork) -> str:
         process = level.process
         assert process is not None
+        own, over = self.kernel(process, level), process.over
+        if over is None:
+            return own
+        beside = [] if over.beside is None else [self.kernel(over.beside, level)]
+        return self.add("sum", of=[own, *beside, self.kernel(over.below, level)])
+
+    def kernel(self, process: LatentProcess, level: LevelNetwork) -> str:
+        """What the runs of one process say."""
         steps = self._latent.get(id(level))
         if steps is not None:
             weights = process.weights(process.runs).norm(dim=1).max()

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -29,9 +29,11 @@ from surrogates.record import Fit
 from surrogates.reductions.reduction import LinearReduction
 from surrogates.settings import LevelSettings, Settings
 from surrogates.surrogate import level_name
+from surrogates.training.coarse_latents import CoarseFields
+from surrogates.training.latents import CoarseLatents, Latents
 from surrogates.training.loop import Objective
 from surrogates.training.objectives import LevelObjective, chunk
-from surrogates.training.regression import Chosen, Latents, choose_regression, left_out_by_process
+from surrogates.training.regression import Chosen, choose_regression, left_out_by_process
 from surrogates.training.trainer import Trainer
 
 # Mean square of what a reduction loses on left-out runs, beside that of their wrongly said latent vectors, which matters.
@@ -69,6 +71,7 @@ class FoldTrainer(Trainer):
     part          (run,) the fold that leaves a run out, the same for a run and its image; images stand behind the runs
     chosen        what was chosen for each level, and `latents` what from
     fewer         whether a level below lost nothing by epochs of fewer states
+    below         runs on a coarser mesh, which may help
     """
 
     original: Campaign
@@ -77,6 +80,7 @@ class FoldTrainer(Trainer):
     chosen: dict[int, Chosen] = field(default_factory=dict)
     latents: dict[int, Latents] = field(default_factory=dict)
     fewer: bool = False
+    below: CoarseFields | None = None
 
     def level(self, number: int, cascade: Cascade, graphs: Graphs) -> Fit:
         started = time.perf_counter()
@@ -86,6 +90,10 @@ class FoldTrainer(Trainer):
         settings = settings.model_copy(update={"states": 1.0})
         level.settle()
         latents = self._encoded(level, runs, cascade)
+        if self.below is not None:
+            coarse = self._coarse(level, graphs.kept(number), cascade, self.below)
+            under = any(cascade.takes_coarse(k) for k in cascade.numbers)
+            latents = replace(latents, coarse=coarse, coarse_below=under)
         chosen = choose_regression(
             level, latents, "process" if interrupted else settings.regression,
             lambda objective: self.fit(objective, settings, name, self.seeded(number)), self.settings.seed,
@@ -116,9 +124,17 @@ class FoldTrainer(Trainer):
     def judged_campaign(self) -> Campaign:
         return self.original
 
-    def left_out(self, number: int, level: LevelNetwork) -> Iterator[NDArray[np.float32]]:
-        """For each run as computed, (state, node, 3), m: what is said of it without it, at its own times."""
-        z = self.chosen[number].left_out(self.latents[number]).cpu().numpy()
+    def left_out(self, number: int, level: LevelNetwork, *, from_coarse: bool = False) -> Iterator[NDArray[np.float32]]:
+        """For each run as computed, (state, node, 3), m: what is said of it without it, at its own times.
+
+        Parameters
+        ----------
+        from_coarse
+            From its own coarse run, where the level takes something from one.
+        """
+        chosen = self.chosen[number]
+        itself = chosen.itself if from_coarse else None
+        z = (chosen.left_out(self.latents[number]) if itself is None else itself).cpu().numpy()
         grid = self.campaign.time
         for run, course in enumerate(z):
 
@@ -258,6 +274,25 @@ class FoldTrainer(Trainer):
             inputs, values, known, _sizes(level, values[known]), lost / max(states, 1),
             torch.from_numpy(self.part).to(self.device), self.own, cascade.inputs.time_column, below,
         )  # fmt: skip
+
+    @torch.no_grad()
+    def _coarse(
+        self, level: LevelNetwork, nodes: NDArray[np.int64], cascade: Cascade, below: CoarseFields
+    ) -> CoarseLatents:
+        """The coarse runs, encoded as the level's own."""
+
+        def encode(states: NDArray[np.float32]) -> NDArray[np.float32]:
+            parts = torch.from_numpy(states).split(chunk(level.n_nodes))
+            return (
+                torch.cat([level.encode((x.transpose(0, 1) / level.scale).to(self.device)) for x in parts])
+                .cpu()
+                .numpy()
+            )
+
+        inputs = torch.from_numpy(below.inputs)
+        scaled = cascade.inputs(inputs, torch.zeros(len(inputs)))[:, : cascade.inputs.time_column]
+        values, twin = below.courses(nodes, encode), below.twin(self.original.parameters)
+        return CoarseLatents(scaled.double().numpy(), values, len(below.keep), twin)
 
 
 def _sizes(level: LevelNetwork, z: torch.Tensor) -> torch.Tensor:

@@ -18,9 +18,12 @@ from torch import Tensor, nn
 
 from surrogates.models.level import LevelNetwork
 from surrogates.record import Fit
+from surrogates.regression.beneath import WORTH_IT
 from surrogates.regression.latent_process import LatentProcess, Wish, fit_process
 from surrogates.regression.network import Course, Regressor, Team
+from surrogates.training.latents import Latents
 from surrogates.training.loop import Diverged, Objective
+from surrogates.training.over_coarse import OverLevel, put_over
 
 # Shares of the process to choose from.
 SHARES: Mapping[Wish, tuple[float, ...]] = {
@@ -30,54 +33,13 @@ SHARES: Mapping[Wish, tuple[float, ...]] = {
 
 # Networks that are so many times as wrong as the process after their trial bring a mixture of both a percent at most.
 _HOPELESS = 1.25
+# What is said behind the name of a mixture with a process over coarse runs.
+_OVER = " over coarse runs"
 
 
 def named(share: float) -> str:
     """What a share of the process is called."""
     return {0.0: "network", 1.0: "process"}.get(share, f"{100 * share:g} % process")
-
-
-@dataclass(frozen=True)
-class Latents:
-    """Encoded training runs of one level; the first `own` are runs as computed, the others their images.
-
-    inputs   (run, state, input) scaled, `time_column` the place of the time
-    values   (run, state, latent)
-    known    (run, state) states that count
-    sizes    (latent,) RMS movement of the nodes for a latent number that moves by one, in the level's unit
-    lost     mean square of what decoding does not give back, in the level's unit
-    part     (run,) the fold that leaves a run out, the same for a run and its image; folds count from 0
-    below    (fold + 1, run, state, coarse latent) what the coarse level's regressions say, those of all runs last
-    """
-
-    inputs: Tensor
-    values: Tensor
-    known: Tensor
-    sizes: Tensor
-    lost: float
-    part: Tensor
-    own: int
-    time_column: int
-    below: Tensor | None = None
-
-    @property
-    def folds(self) -> int:
-        return int(self.part.max()) + 1
-
-    @property
-    def differ(self) -> bool:
-        """Whether the runs differ in any parameter, without which a process has nothing to go by."""
-        parameters = self.inputs[:, 0, : self.time_column]
-        return bool((parameters != parameters[:1]).any())
-
-    @property
-    def time(self) -> Tensor:
-        """(state,) scaled."""
-        return self.inputs[0, :, self.time_column]
-
-    def wrong(self, z: Tensor) -> Tensor:
-        """(run, state) mean square error of displacements for latent vectors `z` of the own runs."""
-        return (z - self.values[: self.own]).square() @ self.sizes.square()
 
 
 @dataclass
@@ -86,6 +48,8 @@ class Chosen:
 
     said      (fold + 1, run, state, latent) latent vectors by the regressions without each part of the runs, and of all
     errors    RMS distance of nodes, m, on left-out runs by what was tried, such as "network" or "process 0.75"
+    coarse    what folds said of coarse runs; None without any
+    itself    (own run, state, latent) of left-out runs, from the coarse run of each; where there is none, as `left_out`
     """
 
     said: Tensor
@@ -94,11 +58,14 @@ class Chosen:
     errors: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     reduction_epochs: int = 0
+    coarse: OverLevel | None = None
+    itself: Tensor | None = None
 
     @property
     def told(self) -> str:
         """The mixture in words."""
-        return named(self.share)
+        over = _OVER if self.coarse is not None and self.coarse.process is not None else ""
+        return named(self.share) + over
 
     def left_out(self, latents: Latents) -> Tensor:
         """(run, state, latent) of the own runs, each by the regression without it."""
@@ -215,12 +182,16 @@ def choose_regression(
     networks: Tensor | None = None
     fitted = Fit()
     processes, process = _processes(latents, shares, seed, mixed)
+    over = None
+    if processes is not None and latents.coarse is not None:
+        over = put_over(latents, latents.coarse, level.scale, seed, mixed)
+    best_process = processes if over is None or over.said is None else over.said
     if shares != (1.0,):
         objective = FoldedNetworks(regressor, courses, latents, level.scale)
         try:
-            if trial is not None and processes is not None and len(shares) > 1:
+            if trial is not None and best_process is not None and len(shares) > 1:
                 fitted = trial(objective)
-                behind = _behind(objective, processes, latents)
+                behind = _behind(objective, best_process, latents)
                 if fitted.status == "finished" and behind > _HOPELESS:
                     notes.append(
                         f"after a trial of {fitted.epochs} epochs the network is {behind:.1f} times as wrong as the process on "
@@ -240,16 +211,38 @@ def choose_regression(
         else:
             networks = _networks(objective, latents)
             regressor.take(objective.regressor, latents.folds * regressor.members)
-    said, errors = {}, {}
-    for share in shares:
-        said[share] = _mixed(networks, processes, share)
-        errors[share] = level.scale * _error(Chosen(said[share], share, fitted).left_out(latents), latents)
+    said, errors = _tried(networks, processes, shares, latents, level.scale)
     best = min(errors, key=lambda share: errors[share])
+    told = {named(share): error for share, error in errors.items()}
+    itself = None
+    if over is not None and over.said is not None:
+        more = _tried(networks, over.said, [share for share in shares if share > 0], latents, level.scale)
+        told |= {f"{named(share)}{_OVER}": error for share, error in more[1].items()}
+        of_them = min(more[1], key=lambda share: more[1][share])
+        # A network may rest on a level below that takes coarse runs already; then both do, and this one alone can start from
+        # a coarse run of the query.
+        margin = WORTH_IT if latents.coarse_below else -WORTH_IT
+        if more[1][of_them] < (1 + margin) * errors[best]:
+            said, best, process = more[0], of_them, over.process
+            itself = over.from_runs(Chosen(said[best], best, fitted).left_out(latents), best, latents)
+        else:
+            over.reject()
+            notes.append("a process over coarse runs brings nothing beside the network, and is left out")
     level.course = courses[-1] if best < 1 else None
     level.process = process if best > 0 else None
     if level.process is not None:
         level.process.share.fill_(best)
-    return Chosen(said[best], best, fitted, {named(share): error for share, error in errors.items()}, notes)
+    return Chosen(said[best], best, fitted, told, notes, coarse=over, itself=itself)
+
+
+def _tried(
+    networks: Tensor | None, processes: Tensor | None, shares: Sequence[float], latents: Latents, scale: float
+) -> tuple[dict[float, Tensor], dict[float, float]]:
+    """What mixtures say (fold + 1, run, state, latent), and their errors, m, on left-out runs, by the share of the process."""
+    said = {share: _mixed(networks, processes, share) for share in shares}
+    return said, {
+        share: scale * _error(Chosen(some, share, Fit()).left_out(latents), latents) for share, some in said.items()
+    }
 
 
 def _networks(objective: FoldedNetworks, latents: Latents) -> Tensor:

@@ -20,17 +20,20 @@ from surrogates.data.scaling import InputScaling
 from surrogates.errors import SurrogateError
 from surrogates.models.average import Average, some_states, spread_of
 from surrogates.models.cascade import Cascade
+from surrogates.models.coarse_base import CoarseMesh
 from surrogates.models.curves import fit_curve
 from surrogates.models.pod_regression import Held, PodFit, fit_pod_regression
 from surrogates.models.unified import Unified
 from surrogates.physics.choice import of_campaign
 from surrogates.physics.trials import Folds
 from surrogates.record import Fit, Record
+from surrogates.regression.beneath import Beneath
 from surrogates.settings import Settings
 from surrogates.surrogate import Surrogate
 from surrogates.training.beside import check_targets, fit_beside
 from surrogates.training.by_folds import FoldTrainer, chooses_by_folds
-from surrogates.training.coarse import check_coarse, note_coarse
+from surrogates.training.coarse import check_coarse, note_coarse, note_coarse_levels
+from surrogates.training.coarse_latents import CoarseFields
 from surrogates.training.loop import Diverged, Epoch, Keeper, device_of
 from surrogates.training.members import averaged, fits_together, trainer_of
 from surrogates.training.refinement import Refined
@@ -38,7 +41,6 @@ from surrogates.training.trainer import Trainer
 from surrogates.uncertainty import (
     FEWEST_BY_FOLDS,
     FEWEST_RUNS,
-    Band,
     Beliefs,
     calibrate_gathered,
     gather,
@@ -124,7 +126,10 @@ def train_surrogate(
     if by_folds:
         trainer = _registered(surrogate, trainer)
     _fit_curves(surrogate, campaign, settings, parts.training, wanted)
-    _judge(surrogate, _fit_members(surrogate, trainer), watch)
+    members = _fit_members(surrogate, trainer)
+    if campaign.coarse is not None:
+        note_coarse_levels(surrogate.record, campaign.coarse, _coarse_said(members))
+    _judge(surrogate, members, watch)
     fit_beside(surrogate, campaign, settings, parts.training, notes)
     return surrogate
 
@@ -139,10 +144,15 @@ def _registered(surrogate: Surrogate, trainer: Trainer) -> FoldTrainer:
     count = len(campaign.parameters)
     part = Folds.of(count, settings.validation.folds, settings.seed).part[0]
     surrogate.core = Cascade(scaling(settings, ranges_of(inner)))
+    coarse, notes = campaign.coarse, trainer.notes
+    below = None
+    if coarse is not None:
+        below = CoarseFields.of(coarse, registration, settings, notes)
+        surrogate.mesh_below = CoarseMesh.of(coarse)
     return FoldTrainer(
         inner, settings, trainer.graphs, registration.split(trainer.split, count), trainer.notes, trainer.device,
         trainer.report, trainer.keeper,
-        part=np.tile(part, len(inner.parameters) // count), original=campaign, registration=registration,
+        part=np.tile(part, len(inner.parameters) // count), original=campaign, registration=registration, below=below,
     )  # fmt: skip
 
 
@@ -266,33 +276,37 @@ def _judge_by_folds(surrogate: Surrogate, trainer: Trainer, found: PodFit, watch
     beliefs = Beliefs(sizes, np.array(deviations), *surrogate.places(parameters))
     surrogate.bands[0, False] = calibrate_gathered(gathered, record.time, beliefs, np.array(places))
     if found.itself is not None:
-        surrogate.run_band = _band_from_runs(surrogate, field, runs, found.itself(), campaign_parameters)
+        judged = ((int(runs[h.run]), h.deviation, distance) for h, distance in _off_held(found.itself(), field, runs))
+        _note_from_runs(surrogate, trainer, (0, False), judged)
 
 
-def _band_from_runs(
-    surrogate: Surrogate,
-    field: LevelRuns,
-    runs: NDArray[np.int64],
-    held: Iterator[Held],
-    parameters: NDArray[np.float64],
-) -> Band | None:
-    """The band of predictions that start from a coarse run of the query; None where too few fine runs have one."""
+def _note_from_runs(
+    surrogate: Surrogate, trainer: Trainer, band: tuple[int, bool],
+    judged: Iterable[tuple[int, float, NDArray[np.float32]]],
+) -> None:  # fmt: skip
+    """The band of predictions that start from a coarse run of the query, where enough fine runs have one.
+
+    Parameters
+    ----------
+    judged
+        Left-out runs that have a coarse run: place, deviation, and distances (state, node), m, of what was said from it.
+    """
     places: list[int] = []
     deviations: list[float] = []
 
     def distances() -> Iterator[NDArray[np.float32]]:
-        for one, distance in _off_held(held, field, runs):
-            places.append(one.run)
-            deviations.append(one.deviation)
+        for run, deviation, distance in judged:
+            places.append(run)
+            deviations.append(deviation)
             yield distance
 
     gathered = gather(distances())
     if len(set(places)) < FEWEST_BY_FOLDS:
-        return None
-    of_runs = parameters[runs[places]]
+        return
+    of_runs = trainer.judged_campaign.parameters[places]
     sizes = surrogate.registration.clock.size(of_runs)
     beliefs = Beliefs(sizes, np.array(deviations), *surrogate.places(of_runs))
-    return calibrate_gathered(gathered, surrogate.record.time, beliefs, np.array(places))
+    surrogate.run_bands[band] = calibrate_gathered(gathered, surrogate.record.time, beliefs, np.array(places))
 
 
 def _fit_members(surrogate: Surrogate, trainer: Trainer) -> list[Member]:
@@ -427,22 +441,49 @@ def _judge(surrogate: Surrogate, members: Sequence[Member], watch: Watch | None 
         _note(surrogate, trainer, name, (number, False), own(), deviations)
         if full is not None and number > 0:
             _note(surrogate, trainer, f"{name}, lifted to the full mesh", (number, True), lifted(), deviations)
+        if surrogate.takes_coarse(number):
+            _judge_from_runs(surrogate, members, number, runs, full, deviations)
         record.errors[f"{name}, reduction alone"] = float(np.mean(reduced))
         if len(members) > 1:
             for (_, own_trainer), errors in zip(members, alone, strict=True):
                 record.members.setdefault(str(own_trainer.settings.seed), {})[name] = float(np.mean(errors))
 
 
-def _left_out(members: Sequence[Member], number: int) -> Iterator[tuple[int, list[NDArray[np.float32]]]]:
-    """Runs, and what each member says of them (state, node, 3), m, without them."""
-    of_members = [_left_out_by(member, trainer, number) for member, trainer in members]
+def _judge_from_runs(
+    surrogate: Surrogate, members: Sequence[Member], number: int, runs: LevelRuns, full: LevelRuns | None,
+    deviations: NDArray[np.float64],
+) -> None:  # fmt: skip
+    """Bands of predictions that start from a coarse run of the query: on the level's own nodes, and lifted."""
+    trainer = members[0][1]
+    if not isinstance(trainer, FoldTrainer) or trainer.below is None:
+        return
+    twin = trainer.below.twin(trainer.original.parameters)
+
+    def judged(field: LevelRuns, *, lifted: bool) -> Iterator[tuple[int, float, NDArray[np.float32]]]:
+        for run, said in _left_out(members, number, from_coarse=True):
+            if twin[run] >= 0:
+                up = (lambda some: surrogate.lift(some, number)) if lifted else (lambda some: some)
+                yield run, float(deviations[run]), _off(_mean_of(said), field, run, up)
+
+    _note_from_runs(surrogate, trainer, (number, False), judged(runs, lifted=False))
+    if full is not None and number > 0:
+        _note_from_runs(surrogate, trainer, (number, True), judged(full, lifted=True))
+
+
+def _left_out(
+    members: Sequence[Member], number: int, *, from_coarse: bool = False
+) -> Iterator[tuple[int, list[NDArray[np.float32]]]]:
+    """Runs, and what each member says of them (state, node, 3), m, without them; or from the coarse run of each."""
+    of_members = [_left_out_by(member, trainer, number, from_coarse=from_coarse) for member, trainer in members]
     for told in zip(*of_members, strict=True):
         yield told[0][0], [said for _, said in told]
 
 
-def _left_out_by(member: Surrogate, trainer: Trainer, number: int) -> Iterator[tuple[int, NDArray[np.float32]]]:
+def _left_out_by(
+    member: Surrogate, trainer: Trainer, number: int, *, from_coarse: bool = False
+) -> Iterator[tuple[int, NDArray[np.float32]]]:
     if isinstance(trainer, FoldTrainer) and isinstance(member.core, Cascade):
-        yield from enumerate(trainer.left_out(number, member.core.levels[number]))
+        yield from enumerate(trainer.left_out(number, member.core.levels[number], from_coarse=from_coarse))
         return
     for run in trainer.split.validation:
         yield int(run), _predicted(member, trainer.campaign, run, number)
@@ -477,6 +518,20 @@ def _deviations(surrogate: Surrogate, members: Sequence[Member]) -> NDArray[np.f
             f"{100 * np.mean(errors):.2g} cm: with these settings the seed changes next to nothing, and one training does as well"
         )
     return core.deviation(spread)
+
+
+def _coarse_said(members: Sequence[Member]) -> dict[str, Beneath]:
+    """What folds said of coarse runs on each level, coarsest first; by seed where there are several."""
+    out = {}
+    for member, trainer in members:
+        for name, number in member.level_names.items():
+            if not isinstance(trainer, FoldTrainer):
+                continue
+            over = trainer.chosen[number].coarse
+            if over is not None:
+                label = name if len(members) == 1 else f"{name}, seed {trainer.settings.seed}"
+                out[label] = over.found
+    return out
 
 
 def _choices(members: Sequence[Member]) -> dict[str, str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -9,7 +11,7 @@ from scipy import sparse
 
 from data_schema.levels import Level
 from data_schema.mirror import MirrorPlane
-from surrogates.data.campaign import Campaign
+from surrogates.data.campaign import Campaign, CoarseRuns
 
 SIDES = (9, 5, 3)
 TIME = np.linspace(0.0, 0.03, 7)
@@ -105,6 +107,41 @@ def folding(runs: int = 40) -> Campaign:
     side = np.where(np.arange(runs) % 2 == 0, 1.0, -1.0) * (np.abs(mu[:, 1]) < 3.0)
     u[..., 1] += (side[:, None, None] * np.abs(u[..., 2])).astype(np.float32)
     return campaign(runs, displacement=lambda level: u)
+
+
+def waving(mu: np.ndarray) -> np.ndarray:
+    """(sim, state, node, 3): the plate's dent, deeper and shallower with the strength, which few runs do not show."""
+    wave = 1 + 0.8 * np.sin(9 * (mu[:, 2] - 2e8) / 3e8)
+    return np.asarray(displacement(mu) * wave[:, None, None, None], np.float32)
+
+
+def seen_coarsely(mu: np.ndarray) -> np.ndarray:
+    """The same on every second node, a tenth too stiff."""
+    return np.asarray(0.9 * waving(mu)[:, :, levels()[0].kept], np.float32)
+
+
+def noise(mu: np.ndarray) -> np.ndarray:
+    """Coarse runs of the same size and with no relation to the fine ones."""
+    draw = np.random.default_rng(5).standard_normal((len(mu), len(TIME), len(levels()[0].kept), 3))
+    return np.asarray(0.1 * draw * (TIME / TIME[-1])[:, None, None], np.float32)
+
+
+def waving_campaign(
+    runs: int = 10, coarse: Callable[[np.ndarray], np.ndarray] | None = seen_coarsely, more: int = 50
+) -> Campaign:
+    """`runs` fine runs of the waving plate, with coarse ones of the same parameters and `more` others beneath them."""
+    mu, level = parameters(runs), levels()
+    u = waving(mu)
+    fine = campaign(runs, displacement=lambda k: u if k == 0 else u[:, :, level[k - 1].kept])
+    if coarse is None:
+        return fine
+    below = np.concatenate([mu, parameters(more, seed=3)])
+    field = coarse(below)
+    other = replace(
+        fine, parameters=below, displacement=lambda k: field, n_nodes=len(level[0].kept), points=grid(SIDES[0])[level[0].kept],
+        levels=(), checksum="facade", runs=tuple(f"coarse_{k}" for k in range(len(below))),
+    )  # fmt: skip
+    return replace(fine, coarse=CoarseRuns(other, level[0].to_full))
 
 
 # Settings of a process that takes a folding plate as it is, without the physics that would be tried first.

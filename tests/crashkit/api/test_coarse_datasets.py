@@ -102,7 +102,7 @@ def test_the_fine_runs_themselves_are_no_coarse_runs() -> None:
 
 
 def test_other_models_refuse_coarse_runs_before_they_are_read() -> None:
-    with pytest.raises(SurrogateError, match="beneath pod-gpr"):
+    with pytest.raises(SurrogateError, match="beneath mh and pod-gpr"):
         crashkit.train(dataset(9, range(6)), model="pod-rbf", coarse="no_such.zarr")
 
 
@@ -149,7 +149,7 @@ def test_a_run_of_another_mesh_or_of_other_parameters_is_refused(model: Model, r
 
 def test_a_model_of_fine_runs_alone_refuses_a_coarse_run() -> None:
     plain = crashkit.train(dataset(9, range(6)), model="pod-gpr", settings=OFF)
-    with pytest.raises(DataError, match="train pod-gpr with --coarse"):
+    with pytest.raises(DataError, match="train mh or pod-gpr with --coarse"):
         plain.predict(at(71), coarse_run=dataset(5, range(71, 72)))
 
 

@@ -14,9 +14,9 @@ from scipy import sparse
 
 from surrogates.data.campaign import CoarseRuns
 from surrogates.errors import ModelFolderError, SurrogateError
-from surrogates.models.coarse_fit import ALONE, OF_QUERY
 from surrogates.models.pod_regression import PodRegression
 from surrogates.queries.points import AtPoints
+from surrogates.regression.beneath import ALONE, OF_QUERY
 from surrogates.settings import settings
 from surrogates.storage.browser import browsable
 from surrogates.storage.card import card
@@ -26,45 +26,16 @@ from surrogates.training.train import train_surrogate
 
 OFF = ["physics.clock=off", "physics.symmetry=off", "inputs.derived=off", "pod.modes=[16]"]
 LEVEL = plate.levels()[0]
-Field = Callable[[NDArray[np.float64]], NDArray[np.float32]]
 
 
-def folding(parameters: NDArray[np.float64]) -> NDArray[np.float32]:
-    """(sim, state, node, 3): the plate's dent, deeper and shallower with the strength, which few runs do not show."""
-    wave = 1 + 0.8 * np.sin(9 * (parameters[:, 2] - 2e8) / 3e8)
-    return (plate.displacement(parameters) * wave[:, None, None, None]).astype(np.float32)
-
-
-def seen_coarsely(parameters: NDArray[np.float64]) -> NDArray[np.float32]:
-    """The same on every second node, a tenth too stiff."""
-    return 0.9 * folding(parameters)[:, :, LEVEL.kept]
-
-
-def noise(parameters: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Of the same size and with no relation to the runs."""
-    draw = np.random.default_rng(5).standard_normal((len(parameters), len(plate.TIME), len(LEVEL.kept), 3))
-    return (0.1 * draw * (plate.TIME / plate.TIME[-1])[:, None, None]).astype(np.float32)
-
-
-def trained(coarse: Field | None, runs: int = 10, more: int = 50) -> Surrogate:
-    mu = plate.parameters(runs)
-    campaign = plate.campaign(runs)
-    campaign = replace(campaign, displacement=lambda level: folding(mu), mirrors=(), levels=())
-    if coarse is not None:
-        below = np.concatenate([mu, plate.parameters(more, seed=3)])
-        field = coarse(below)
-        other = replace(
-            campaign, parameters=below, displacement=lambda level: field, n_nodes=len(LEVEL.kept),
-            points=campaign.points[LEVEL.kept] if campaign.points is not None else None, checksum="facade",
-            runs=tuple(f"coarse_{k}" for k in range(len(below))),
-        )  # fmt: skip
-        campaign = replace(campaign, coarse=CoarseRuns(other, LEVEL.to_full))
+def trained(coarse: Callable[[NDArray[np.float64]], NDArray[np.float32]] | None) -> Surrogate:
+    campaign = replace(plate.waving_campaign(10, coarse), levels=())
     return train_surrogate(campaign, settings("pod-gpr", overrides=OFF))
 
 
 def error(surrogate: Surrogate) -> float:
     mu = plate.parameters(20, seed=9)
-    return float(np.linalg.norm(surrogate.predict(mu) - folding(mu), axis=-1).mean())
+    return float(np.linalg.norm(surrogate.predict(mu) - plate.waving(mu), axis=-1).mean())
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +45,7 @@ def alone() -> Surrogate:
 
 @pytest.fixture(scope="module")
 def helped() -> Surrogate:
-    return trained(seen_coarsely)
+    return trained(plate.seen_coarsely)
 
 
 def test_coarse_runs_that_know_more_lower_the_error(alone: Surrogate, helped: Surrogate) -> None:
@@ -85,34 +56,34 @@ def test_coarse_runs_that_know_more_lower_the_error(alone: Surrogate, helped: Su
 
 
 def test_coarse_runs_that_say_nothing_change_nothing(alone: Surrogate) -> None:
-    useless = trained(noise)
+    useless = trained(plate.noise)
     mu = plate.parameters(5, seed=9)
     assert useless.record.coarse["way"] == ALONE
     assert any("fine runs alone are kept" in note for note in useless.record.notes)
     np.testing.assert_array_equal(useless.predict(mu), alone.predict(mu))
     with pytest.raises(SurrogateError, match="did not pay"):
-        useless.predict_from_coarse(mu[0], noise(mu)[0], plate.TIME)
+        useless.predict_from_coarse(mu[0], plate.noise(mu)[0], plate.TIME)
 
 
 def test_a_coarse_run_of_the_query_is_taken_over(helped: Surrogate) -> None:
     mu = plate.parameters(20, seed=9)
     from_itself = np.stack(
-        [helped.predict_from_coarse(p, seen, plate.TIME) for p, seen in zip(mu, seen_coarsely(mu), strict=True)]
+        [helped.predict_from_coarse(p, seen, plate.TIME) for p, seen in zip(mu, plate.seen_coarsely(mu), strict=True)]
     )
-    assert np.linalg.norm(from_itself - folding(mu), axis=-1).mean() < error(helped)
+    assert np.linalg.norm(from_itself - plate.waving(mu), axis=-1).mean() < error(helped)
     assert helped.record.coarse["errors"][OF_QUERY] < helped.record.coarse["errors"][ALONE]
 
 
 def test_another_coarse_run_says_something_else(helped: Surrogate) -> None:
     mu = plate.parameters(2, seed=9)
-    one, other = (helped.predict_from_coarse(mu[0], seen, plate.TIME) for seen in seen_coarsely(mu))
+    one, other = (helped.predict_from_coarse(mu[0], seen, plate.TIME) for seen in plate.seen_coarsely(mu))
     assert np.abs(one - other).max() > 0.01
 
 
 def test_the_folder_needs_no_coarse_runs_and_predicts_the_same(helped: Surrogate, tmp_path: Path) -> None:
     again = load(save(helped, tmp_path / "m"))
     mu = plate.parameters(3, seed=9)
-    seen = seen_coarsely(mu)[0]
+    seen = plate.seen_coarsely(mu)[0]
     np.testing.assert_allclose(again.predict(mu), helped.predict(mu), atol=1e-7)
     np.testing.assert_allclose(
         again.predict_from_coarse(mu[0], seen, plate.TIME),
@@ -128,9 +99,9 @@ def test_the_folder_needs_no_coarse_runs_and_predicts_the_same(helped: Surrogate
 def test_a_map_that_points_nowhere_is_refused(helped: Surrogate, tmp_path: Path) -> None:
     assert isinstance(helped.core, PodRegression)
     assert helped.core.base is not None
-    right, wrong = helped.core.base, helped.core.base.to_fine.copy()
+    right, wrong = helped.core.base, helped.core.base.mesh.to_fine.copy()
     wrong.indices[0] = 10_000
-    helped.core.base = replace(right, to_fine=wrong)
+    helped.core.base = replace(right, mesh=replace(right.mesh, to_fine=wrong))
     try:
         save(helped, tmp_path / "m")
     finally:
@@ -167,5 +138,5 @@ def test_a_page_with_sliders_says_that_it_cannot(helped: Surrogate) -> None:
 
 def test_other_models_refuse_coarse_runs() -> None:
     campaign = plate.campaign(6)
-    with pytest.raises(SurrogateError, match="coarse runs go beneath pod-gpr"):
+    with pytest.raises(SurrogateError, match="coarse runs go beneath mh and pod-gpr"):
         train_surrogate(replace(campaign, coarse=CoarseRuns(campaign, LEVEL.to_full)), settings("pod-rbf"))

@@ -15,11 +15,11 @@ from torch import Tensor
 from surrogates.record import Fit
 from surrogates.regression.gaussian import Gaussian
 from surrogates.regression.network import Course, Regressor
+from surrogates.training.latents import Latents
 from surrogates.training.loop import Diverged, Objective
 from surrogates.training.regression import (
     Chosen,
     FoldedNetworks,
-    Latents,
     choose_regression,
     course_of,
     left_out_by_process,
