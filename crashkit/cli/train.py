@@ -56,7 +56,7 @@ def command(
     coarse: Annotated[
         Path | None,
         typer.Option(
-            help="Dataset of runs on a coarser mesh of the same structure, beneath few fine ones (pod-gpr): coarse.zarr.",
+            help="Dataset of runs on a coarser mesh of the same structure, beneath few fine ones (mh, pod-gpr): coarse.zarr.",
             show_default="none",
         ),
     ] = None,
