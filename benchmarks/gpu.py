@@ -8,12 +8,16 @@ step on a CPU with tiny sizes, and its figures mean nothing. It writes into the
 folder, after each part, results.json (every figure) and results.md (the same as a table):
 
     levels     MH3, MH2 and MH1 of the paper's preset on the campaign's training runs: seconds an epoch with the step
-               captured as one graph and with one call after the other, and the error of both on the same held-out runs
+               captured as one graph and with one call after the other, sparse and dense operators, the losses of each
+               epoch, and the error on validation runs
     peer       a step of the same networks of torch_geometric's ChebConv against ours, captured and not (`train_step`);
                torch_geometric's drops edges by a mask in every pass, which no graph can capture
     predict    a run of all states at each level, alone and 64 runs at once
-    vehicle    level 1 of a campaign of `--vehicle` nodes (made as `vehicle.py` does) in bfloat16 and in float32: seconds
-               an epoch, peak device memory, and the error of both
+    vehicle    the levels of a campaign of `--vehicle` nodes (made as `vehicle.py` does) in float32, tf32 and bfloat16:
+               seconds an epoch, peak device memory, and the error on validation runs
+
+`--data` and `--vehicle-data` take datasets with their hierarchy that are ready, so that nothing needs VTK on the device's
+machine.
 
 The goal: an epoch of MH1 at 1165 nodes, 9696 samples, in less than 0.1 s.
 """
@@ -25,6 +29,7 @@ import json
 import sys
 import tempfile
 import time
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -49,28 +54,48 @@ def synchronised(call: Callable[[], Any]) -> float:
 
 
 def trained(
-    data: Path, out: Path, epochs: int, captured: bool, device: str, more: tuple[str, ...] = ()
-) -> tuple[Any, float]:
-    """A model of the paper's preset, and the device's peak memory, GiB."""
+    data: Path,
+    out: Path,
+    epochs: int,
+    captured: bool,
+    options: argparse.Namespace,
+    more: tuple[str, ...] = (),
+    test: str | float | None = None,
+) -> Results:
+    """Train the paper's cascade; of each level the seconds of an epoch, the error on validation runs, the losses; peak memory."""
     import crashkit
     from surrogates.training import loop, trainer
 
-    if device == "cuda":
+    cuda = options.device == "cuda"
+    if cuda:
         torch.cuda.reset_peak_memory_stats()
+    out_of: Results = {"seconds_per_epoch": {}, "error_cm": {}, "loss": {}}
 
-    def fit(*arguments: Any, **named: Any) -> Any:
-        return loop.fit(*arguments, **named, captured=captured)
+    def fit(*arguments: Any, name: str, report: Any = None, **named: Any) -> Any:
+        ends, heard = [time.perf_counter()], []
+
+        def told(epoch: Any) -> None:
+            ends.append(time.perf_counter())
+            heard.append(epoch)
+
+        found = loop.fit(*arguments, name=name, report=told, **named, captured=captured)
+        # The first epoch also warms up, and records the graph.
+        out_of["seconds_per_epoch"][name] = float(np.median(np.diff(ends)[1:]))
+        out_of["error_cm"][name] = 100 * float(heard[-1].best_error)
+        out_of["loss"][name] = [float(epoch.total) for epoch in heard]
+        return found
 
     before = trainer.run_epochs
     trainer.run_epochs = fit
     try:
-        model = crashkit.train(
-            data, out, "mh", preset="paper", settings=[f"level.epochs={epochs}", "transfer.epochs=1", *more], device=device,
-            test=0.2, overwrite=True, progress=False,
+        crashkit.train(
+            data, out, "mh", preset="paper", device=options.device, test=test or options.test, overwrite=True, progress=False,
+            settings=["validation.measure=runs", f"level.epochs={epochs}", "transfer.epochs=1", *more],
         )  # fmt: skip
     finally:
         trainer.run_epochs = before
-    return model, torch.cuda.max_memory_allocated() / 2**30 if device == "cuda" else 0.0
+    out_of["peak_gib"] = torch.cuda.max_memory_allocated() / 2**30 if cuda else 0.0
+    return out_of
 
 
 def prepared(source: Path, place: Path, nodes: str) -> Path:
@@ -83,34 +108,21 @@ def prepared(source: Path, place: Path, nodes: str) -> Path:
     return data
 
 
-def errors(model: Any, data: Path) -> dict[str, float]:
-    """Mean node error on the held-out runs by level, cm, on each level's own nodes."""
-    import xarray as xr
-
-    from crashkit.mesh.store import level_displacement
-
-    out = {}
-    with xr.open_dataset(data, engine="zarr", consolidated=False) as dataset:
-        names = [str(n) for n in dataset["sim"].values]
-        held = [names.index(n) for n in model.record.held_out_runs]
-        for name, level in model.levels.items():
-            found = []
-            for run in held:
-                asked = {p: float(dataset[p].values[run]) for p in model.parameters}
-                said = model.predict(asked, level=level, extrapolate=True)["displacement"].values
-                found.append(np.linalg.norm(said - level_displacement(data, level, [run])[0], axis=-1).mean())
-            out[name] = 100 * float(np.mean(found))
-    return out
-
-
 def levels(data: Path, place: Path, options: argparse.Namespace) -> Results:
-    out: Results = {}
-    for captured in (True, False):
-        model, peak = trained(data, place / "mh", options.epochs, captured, options.device)
-        out["captured" if captured else "eager"] = {
-            "seconds_per_epoch": {name: model.surrogate.seconds_per_epoch(k) for name, k in model.levels.items()},
-            "error_cm": errors(model, data), "peak_gib": peak,
-        }  # fmt: skip
+    """Both forms of the step from the same start; the operator of the finest level in both of its forms."""
+    from surrogates.operators import graph
+
+    out: Results = {"captured": trained(data, place / "mh", options.epochs, True, options)}
+    out["eager"] = trained(data, place / "eager", max(2, options.epochs // 4), False, options)
+    before = dict(graph.DENSE_UP_TO)
+    for form, limit in (("sparse operators", 0), ("dense operators", 4096)):
+        graph.DENSE_UP_TO["cuda"] = limit
+        try:
+            found = trained(data, place / "form", max(2, options.epochs // 4), True, options)
+            out[f"captured, {form}"] = found
+        except Exception as error:
+            out[f"captured, {form}"] = {"failed": f"{type(error).__name__}: {error}"}
+    graph.DENSE_UP_TO.update(before)
     return out
 
 
@@ -200,22 +212,26 @@ def predict(data: Path, place: Path, options: argparse.Namespace) -> Results:
 
 
 def vehicle(data: Path, place: Path, options: argparse.Namespace) -> Results:
-    from vehicle import make
+    """Levels 3 to 1 of a campaign of vehicle size, in each precision."""
+    large = options.vehicle_data
+    if large is None:
+        from vehicle import make
 
-    from crashkit.dataset import demo_data
+        from crashkit.dataset import demo_data
 
-    source = place / "vehicle.h5"
-    nodes = make(source, options.campaign or demo_data(), options.vehicle, *options.runs)
-    large = prepared(source, place, f"{nodes // 8},{nodes // 64},{nodes // 512}")
-    out: Results = {"nodes": nodes // 8}
-    for precision in ("float32", "bfloat16"):
-        more = (f"precision={precision}", "level.batch=32")
-        model, peak = trained(large, place / "vehicle", max(2, options.epochs // 4), True, options.device, more)
-        finest = list(model.levels)[-1]
-        out[precision] = {
-            "seconds_per_epoch": model.surrogate.seconds_per_epoch(model.levels[finest]), "peak_gib": peak,
-            "error_cm": errors(model, large)[finest],
-        }  # fmt: skip
+        source = place / "vehicle.h5"
+        nodes = make(source, options.campaign or demo_data(), options.vehicle, *options.runs)
+        large = prepared(source, place, f"{nodes // 8},{nodes // 64},{nodes // 512}")
+    out: Results = {}
+    for precision in ("float32", "tf32", "bfloat16"):
+        out[precision] = trained(
+            large,
+            place / "vehicle",
+            options.vehicle_epochs,
+            True,
+            options,
+            (f"precision={precision}", "level.batch=32"),
+        )
     return out
 
 
@@ -235,6 +251,23 @@ def table(results: Results) -> str:
     return "\n".join(["| what | figure |", "|---|---|", *rows(results, ())]) + "\n"
 
 
+def _campaign(place: Path, options: argparse.Namespace) -> Path:
+    """The campaign that was named, or the embedded one, as a dataset with its hierarchy."""
+    import h5py
+
+    from crashkit.dataset import demo_data
+
+    source = options.campaign or demo_data()
+    with h5py.File(source) as file:
+        n = file["kart/displacements"].shape[2]
+    if options.rehearse:
+        from vehicle import make
+
+        source = place / "small.h5"
+        n = make(source, options.campaign or demo_data(), n, *options.runs)
+    return prepared(source, place, options.nodes or f"{n // 8},{n // 32},{n // 128}")
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", "-o", type=Path, default=Path("gpu-results"))
@@ -244,40 +277,34 @@ def main() -> int:
     )
     parser.add_argument("--epochs", type=int, default=20)
     parser.add_argument("--vehicle", type=int, default=300_000, help="nodes of the large campaign")
+    parser.add_argument("--data", type=Path, help="a ready dataset with its hierarchy, instead of --campaign")
+    parser.add_argument("--vehicle-data", type=Path, help="the same for the large campaign")
+    parser.add_argument("--test", default=0.2, help="test runs, which are left out of everything, as --test of train")
+    parser.add_argument("--vehicle-epochs", type=int, default=8)
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--rehearse", action="store_true", help="on a CPU with tiny sizes: does it go to its end?")
     options = parser.parse_args()
     options.device, options.peer, options.steps, options.runs = "cuda", (73, 292, 1165), 50, (24, 51)
     if options.rehearse:
         options.device, options.peer, options.steps, options.runs = "cpu", (19,), 2, (8, 6)
-        options.epochs, options.vehicle = 2, 2400
+        options.epochs, options.vehicle, options.vehicle_epochs = 2, 2400, 2
     elif not torch.cuda.is_available():
         print(
             f"no CUDA device is there (torch {torch.__version__}); this benchmark needs one, and nothing was measured"
         )
         return NO_DEVICE
-    from crashkit.dataset import demo_data
-
     options.output.mkdir(parents=True, exist_ok=True)
     device = "rehearsed on a CPU; figures mean nothing" if options.rehearse else torch.cuda.get_device_name()
     results: Results = {"device": device, "torch": torch.__version__}
     with tempfile.TemporaryDirectory(prefix="gpu-") as scratch:
-        place, source = Path(scratch), options.campaign or demo_data()
-        import h5py
-
-        with h5py.File(source) as file:
-            n = file["kart/displacements"].shape[2]
-        if options.rehearse:
-            from vehicle import make
-
-            source = place / "small.h5"
-            n = make(source, options.campaign or demo_data(), n, *options.runs)
-        data = prepared(source, place, options.nodes or f"{n // 8},{n // 32},{n // 128}")
+        place = Path(scratch)
+        data = options.data or _campaign(place, options)
         for name in options.only:
             started = time.perf_counter()
             try:
                 results[name] = PARTS[name](data, place, options)
             except Exception as error:  # what one part runs into must not cost the others
+                traceback.print_exc()
                 results[name] = {"failed": f"{type(error).__name__}: {error}"}
             results[f"{name}, s"] = time.perf_counter() - started
             (options.output / "results.json").write_text(json.dumps(results, indent=1), encoding="utf-8")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from surrogates.errors import SurrogateError
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor
 
 # Bytes up to which an array stays in memory.
@@ -78,6 +79,16 @@ class StoredStates:
     def __len__(self) -> int:
         return self._shelf.rows
 
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of one state: (3, node)."""
+        return self._shelf.shape
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all states."""
+        return 4 * len(self) * int(np.prod(self.shape, dtype=np.int64))
+
     def __getitem__(self, index: Tensor | slice) -> Tensor:
         import torch
 
@@ -87,6 +98,27 @@ class StoredStates:
     def split(self, count: int) -> Iterator[Tensor]:
         """All states, `count` at a time."""
         return (self[slice(k, min(k + count, len(self)))] for k in range(0, len(self), count))
+
+
+def moved(states: States, device: torch.device, room: int | None = None) -> States:
+    """States on `device`: from a file into the memory of a CUDA device that has room for them, else they stay there.
+
+    room  bytes that they may take; None: half of what is free on a CUDA device, nothing elsewhere
+    """
+    import torch
+
+    if isinstance(states, torch.Tensor):
+        return states.to(device)
+    if room is None:
+        room = torch.cuda.mem_get_info(device)[0] // 2 if device.type == "cuda" else 0
+    if states.nbytes > room:
+        return states
+    out = torch.empty((len(states), *states.shape), device=device)
+    row = 0
+    for part in states.split(1024):
+        out[row : row + len(part)] = part
+        row += len(part)
+    return out
 
 
 States: TypeAlias = "Tensor | StoredStates"

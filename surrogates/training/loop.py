@@ -7,6 +7,7 @@ order of samples in an epoch follows from seed and epoch alone, so a resumed tra
 from __future__ import annotations
 
 import contextlib
+import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -30,6 +31,9 @@ if TYPE_CHECKING:
     from surrogates.surrogate import Surrogate
 
 
+_log = logging.getLogger(__name__)
+
+
 class Objective(nn.Module):
     """A network and the samples it is trained on; subclasses say what one batch costs.
 
@@ -46,6 +50,11 @@ class Objective(nn.Module):
     def validation(self) -> Tensor | None:
         """Losses (2,) over the validation samples; None where there are none."""
         raise NotImplementedError
+
+    @property
+    def in_place(self) -> bool:
+        """Whether all that a step reads lies on the device of the networks, so that its calls can be recorded there."""
+        return False
 
     def pieces(self, batch: int) -> int:
         """Into how many pieces a batch of so many samples is cut, one gradient after the other being added up."""
@@ -121,14 +130,15 @@ def fit(
     precision: str = "float32",
     report: Callable[[Epoch], None] | None = None,
     keeper: Keeper | None = None,
-    captured: bool = False,
+    captured: bool | None = None,
 ) -> Fit:
     """Train what `objective` holds and leave the weights of its best epoch in place.
 
     Samples that do not fill a batch are left out of an epoch, other ones each time. Under torchrun each process takes
     its share of every batch, so the losses are those of one process with the same `settings.batch`.
 
-    With `captured` the step is one CUDA graph where there is a CUDA device (`CapturedStep`).
+    On a CUDA device the step is recorded once and then sent as one CUDA graph (`CapturedStep`), which changes nothing in the
+    result; `captured` says whether it is. None: where one process trains on states that lie on the device.
 
     Raises Diverged, with the best weights so far in place and the history on it, if a loss is not finite.
     KeyboardInterrupt ends the training early with status "interrupted" once an epoch is done.
@@ -145,7 +155,7 @@ def fit(
         del stored
     weights = torch.tensor([settings.weight_approximation, settings.weight_reconstruction], device=device)
     cut = 1 if torch.distributed.is_initialized() else objective.pieces(plan.batch)
-    step = _kind_of_step(objective, settings, precision, captured)(
+    step = _kind_of_step(objective, settings, precision, captured, device)(
         _distributed(objective), optimiser, weights, settings.clip, precision, cut
     )
     started, spent = time.perf_counter(), out.seconds
@@ -310,7 +320,8 @@ class CapturedStep(_Step):
 
     What changes from step to step, the samples' numbers and the rates, lies in tensors that stay where they are. The
     first steps are taken one call at a time, as a capture wants it, and count as any others. Where there is no CUDA
-    device, all steps are, through the same code. Experimental: benchmarks/gpu.py measures what it is worth.
+    device, or its calls cannot be recorded, all steps are, through the same code. `benchmarks/gpu.py` measures what it is
+    worth: small networks wait for single calls, six to eleven times as long as for what they compute.
     """
 
     _BEFORE = 3
@@ -346,19 +357,34 @@ class CapturedStep(_Step):
             torch.cuda.current_stream(self.device).wait_stream(side)
             return losses
         if self.graph is None:
-            self.graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(self.graph):
-                self.losses = self.taken(self.index)
+            try:
+                self.graph = self._recorded()
+            except RuntimeError as error:
+                # Recording moves no weight, so this step is still to be taken.
+                _log.warning("the device takes the calls of a step one by one, which is slower (%s)", error)
+                self.cuda = False
+                return self.taken(self.index)
         self.graph.replay()
         return self.losses.clone()
+
+    def _recorded(self) -> torch.cuda.CUDAGraph:
+        """The calls of a step, none of them made yet."""
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            self.losses = self.taken(self.index)
+        return graph
 
     def rest(self) -> None:
         """Gradients belong to the graph."""
 
 
-def _kind_of_step(objective: Objective, settings: LevelSettings, precision: str, captured: bool) -> type[_Step]:
+def _kind_of_step(
+    objective: Objective, settings: LevelSettings, precision: str, captured: bool | None, device: torch.device
+) -> type[_Step]:
     if torch.distributed.is_initialized():
         return _Step
+    if captured is None:
+        captured = device.type == "cuda" and objective.in_place
     if captured:
         return CapturedStep
     # A limit on the gradient's norm needs all of it.

@@ -54,6 +54,11 @@ class Samples:
         return len(self.inputs)
 
     @property
+    def in_place(self) -> bool:
+        """Whether the states lie on the device of the inputs."""
+        return isinstance(self.states, Tensor) and self.states.device == self.inputs.device
+
+    @property
     def in_memory(self) -> Tensor:
         """The states as a tensor.
 
@@ -74,8 +79,7 @@ class Samples:
         )
         initial = None
         if self.initial is not None and self.run is not None:
-            which = self.run[index] if len(self.initial) > 1 else torch.zeros(1, dtype=torch.int64)
-            initial = as_states(self.initial[which.to(self.initial.device)])
+            initial = as_states(self.initial if len(self.initial) == 1 else self.initial[self.run[index]])
         return as_states(self.states[index].to(self.inputs.device)), self.inputs[index], known, initial
 
     def chunks(self) -> Iterator[Tensor]:
@@ -102,6 +106,10 @@ class LevelObjective(Objective):
         self.level, self.reduction_alone = level, reduction_alone
         self.training_samples, self.validation_samples = training, validation
         self.size = len(training)
+
+    @property
+    def in_place(self) -> bool:
+        return self.training_samples.in_place
 
     @property
     def scale(self) -> float:
@@ -193,6 +201,10 @@ class LatentObjective(Objective):
         self.weight = modes.decode_matrix.detach().square().sum(dim=0) / (3 * level.n_nodes)
 
     @property
+    def in_place(self) -> bool:
+        return self.training_samples.in_place
+
+    @property
     def scale(self) -> float:
         return self.level.scale
 
@@ -229,6 +241,10 @@ class UnifiedObjective(Objective):
         self.network = network
         self.training_samples, self.validation_samples = training, validation
         self.size = len(training)
+
+    @property
+    def in_place(self) -> bool:
+        return self.training_samples.in_place
 
     @property
     def scale(self) -> float:

@@ -15,7 +15,7 @@ from surrogates.data.campaign import Campaign
 from surrogates.data.graphs import Graphs
 from surrogates.data.samples import LevelRuns, Notes, ValidationSplit, scale_of
 from surrogates.data.scaling import InputScaling
-from surrogates.data.shelf import States, divide
+from surrogates.data.shelf import States, divide, moved
 from surrogates.models.cascade import Cascade, build_level
 from surrogates.models.level import LevelNetwork
 from surrogates.models.unified import Unified
@@ -216,7 +216,7 @@ class Trainer:
     @torch.no_grad()
     def _samples(self, level: LevelNetwork, states: States, inputs: Tensor, runs: int) -> Samples:
         """Samples on the device, with what the frozen levels say of them."""
-        out = Samples(states.to(self.device) if isinstance(states, Tensor) else states, inputs)
+        out = Samples(moved(states, self.device), inputs)
         if level.with_initial:
             out = self._with_initial(out, runs)
         if level.coarse is None:
@@ -231,7 +231,7 @@ class Trainer:
     def _with_initial(self, samples: Samples, runs: int) -> Samples:
         """`samples` with the first state of every run, once where all runs start alike."""
         count = len(self.campaign.time)
-        first = samples.states[::count]
+        first = samples.states[::count].to(self.device)
         alike = bool((first == first[:1]).all())
         run = torch.arange(runs, device=self.device).repeat_interleave(count)
         return replace(samples, initial=first[:1] if alike else first, run=run)

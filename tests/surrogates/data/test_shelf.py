@@ -9,7 +9,7 @@ import torch
 
 from surrogates.data import shelf as module
 from surrogates.data.samples import LevelRuns, Notes
-from surrogates.data.shelf import Shelf, StoredStates, divide
+from surrogates.data.shelf import Shelf, StoredStates, divide, moved
 from surrogates.errors import SurrogateError
 from surrogates.settings import settings
 from surrogates.training import objectives
@@ -24,6 +24,17 @@ def test_rows_come_back_from_a_file_as_from_memory() -> None:
         shelf.put(0, values[:4])
         np.testing.assert_array_equal(shelf.take(np.array([8, 0, 3])), values[[8, 0, 3]])
         assert (shelf.array is None) == (in_memory == 0)
+
+
+@pytest.mark.parametrize("room", [239, 240])
+def test_states_leave_the_file_for_a_device_with_room(room: int) -> None:
+    values = torch.arange(60.0).reshape(5, 3, 4)
+    shelf = Shelf(5, (3, 4), in_memory=0)
+    shelf.put(0, values.numpy())
+    stored = StoredStates(shelf)
+    divide(stored, 2.0)
+    found = moved(stored, torch.device("cpu"), room)
+    assert found is stored if room < 240 else torch.equal(found, values / 2)
 
 
 def test_stored_states_are_indexed_and_divided_as_a_tensor_is() -> None:

@@ -49,8 +49,11 @@ def weights(given: LevelObjective) -> dict[str, torch.Tensor]:
     return {name: tensor.detach().clone() for name, tensor in given.level.named_parameters()}
 
 
+CPU = torch.device("cpu")
+
+
 def kind_of_step(given: LevelObjective, **changes: Any) -> type:
-    return loop._kind_of_step(given, SETTINGS.model_copy(update=changes), "float32", captured=False)
+    return loop._kind_of_step(given, SETTINGS.model_copy(update=changes), "float32", None, CPU)
 
 
 @pytest.fixture
@@ -88,7 +91,7 @@ def test_gradients_added_in_place_are_those_of_the_formulas(staged: None, monkey
 )
 def test_what_needs_all_gradients_is_not_in_stages(staged: None, changes: dict[str, Any], precision: str) -> None:
     own = SETTINGS.model_copy(update=changes)
-    assert loop._kind_of_step(objective(), own, precision, captured=False) is loop._Step
+    assert loop._kind_of_step(objective(), own, precision, None, CPU) is loop._Step
 
 
 def test_small_levels_and_parts_that_may_share_weights_are_not_in_stages(monkeypatch: pytest.MonkeyPatch) -> None:

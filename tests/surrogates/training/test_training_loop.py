@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import plate
@@ -700,6 +701,38 @@ def test_the_step_that_is_captured_on_a_gpu_goes_the_same_way_on_the_cpu() -> No
     first, second = trained(eager), trained(captured, captured=True)
     assert weights(eager) == pytest.approx(weights(captured), rel=1e-6)
     assert first.history["total"] == pytest.approx(second.history["total"], rel=1e-6)
+
+
+def test_steps_are_captured_where_all_they_read_lies_on_a_cuda_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    def kind(device: str, captured: bool | None = None) -> type:
+        return loop._kind_of_step(Line(), SETTINGS, "float32", captured, torch.device(device))
+
+    monkeypatch.setattr(Line, "in_place", True)
+    assert kind("cuda") is loop.CapturedStep
+    assert kind("cuda", False) is kind("cpu") is loop._Step
+    monkeypatch.setattr(Line, "in_place", False)
+    assert kind("cuda") is loop._Step
+
+
+def test_what_cannot_be_captured_goes_on_call_by_call(monkeypatch: pytest.MonkeyPatch, caplog: Any) -> None:
+    class Refusing(loop.CapturedStep):
+        _BEFORE = 0
+
+        def __init__(self, *given: Any) -> None:
+            super().__init__(*given)
+            self.cuda = True
+
+        def _recorded(self) -> Any:
+            raise RuntimeError("no copies while recording")
+
+    eager, refused = Line(), Line()
+    trained(eager)
+    monkeypatch.setattr(loop, "CapturedStep", Refusing)
+    trained(refused, captured=True)
+    assert weights(refused) == pytest.approx(weights(eager), rel=1e-6)
+    assert [r.message for r in caplog.records if "one by one" in r.message] == [
+        "the device takes the calls of a step one by one, which is slower (no copies while recording)"
+    ]
 
 
 def test_a_batch_cut_into_pieces_gives_the_gradient_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
