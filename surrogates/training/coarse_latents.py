@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -11,15 +12,35 @@ from numpy.typing import NDArray
 from data_schema.levels import lift
 from surrogates.data.campaign import CoarseRuns
 from surrogates.data.samples import LevelRuns, Notes
+from surrogates.data.shelf import Shelf
 from surrogates.models.coarse_fit import with_inputs
 from surrogates.physics.registration import Registration
 from surrogates.regression.beneath import twins
 from surrogates.settings import Settings
 
+_log = logging.getLogger(__name__)
+
+
+class _Once:
+    """Runs that are read once: every level asks for all of them, and what they are read from is slow."""
+
+    def __init__(self, runs: LevelRuns, count: int) -> None:
+        self._runs = runs
+        self._shelf = Shelf(count, (runs.states, runs.nodes, 3))
+        self._there = np.zeros(count, bool)
+
+    def read(self, run: int) -> NDArray[np.float32]:
+        """(state, node, 3), m"""
+        if not self._there[run]:
+            self._shelf.put(run, self._runs.read(run)[None])
+            self._there[run] = True
+        out: NDArray[np.float32] = self._shelf.take(np.array([run]))[0]
+        return out
+
 
 @dataclass(frozen=True)
 class CoarseFields:
-    """Coarse runs as fields on fine nodes: run by run, none is kept.
+    """Coarse runs as fields on fine nodes, run by run.
 
     keep  (run,) places of the coarse runs that have the registration's inputs
     """
@@ -27,12 +48,13 @@ class CoarseFields:
     coarse: CoarseRuns
     registration: Registration
     keep: NDArray[np.int64]
-    runs: LevelRuns
+    runs: _Once
 
     @classmethod
     def of(cls, coarse: CoarseRuns, registration: Registration, settings: Settings, notes: Notes) -> CoarseFields:
         keep = with_inputs(coarse, registration, notes)
-        return cls(coarse, registration, keep, LevelRuns(coarse.campaign, 0, settings, notes))
+        runs = LevelRuns(coarse.campaign, 0, settings, notes)
+        return cls(coarse, registration, keep, _Once(runs, len(coarse.campaign.parameters)))
 
     @property
     def inputs(self) -> NDArray[np.float64]:
@@ -60,7 +82,8 @@ class CoarseFields:
             maps.append((mirror.to_image[nodes] @ self.coarse.to_fine).tocsr().astype(np.float32))
         time = self.coarse.campaign.time
         out: list[list[NDArray[np.float32]]] = [[] for _ in maps]
-        for run in self.keep:
+        for done, run in enumerate(self.keep, 1):
+            _log.info("latent numbers of coarse run %d of %d", done, len(self.keep))
             seen = self.runs.read(int(run))
             for k, (rows, courses) in enumerate(zip(maps, out, strict=True)):
                 states = lift(rows, seen)
