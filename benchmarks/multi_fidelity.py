@@ -1,11 +1,14 @@
 """What coarse runs beneath few fine ones bring, and from which cost on they pay.
 
-    python benchmarks/multi_fidelity.py fine.zarr coarse.zarr --test 96:108 [--runs 8,12,16,24,48,96]
+    python benchmarks/multi_fidelity.py fine.zarr coarse.zarr --test 96:108 [--model mh] [--runs 8,12,16,24,48,96]
         [--coarse-runs 24,48,96,0] [--cost 0.19] [--draws 4] [--set physics.odd=[pole_offset]] [--keep rows/]
-        [-o table.md]
+        [--fresh 24] [-o table.md]
 
-POD-GPR is trained on some fine runs, drawn at random (several draws where they are few; the number of the draw is its
-seed), alone and with some coarse runs beneath (0: all of them). Coarse runs with the parameters of a test run are never
+POD-GPR, or with --model mh the cascade (its finest level, on the full mesh; fine.zarr needs a hierarchy), is trained on some
+fine runs, drawn at random (several draws where they are few; the number of the draw is its seed), alone and with some coarse
+runs beneath (0: all of them). Test runs are asked once, at the end of all choices. While something is still to be
+chosen, `--fresh 24` asks in their place so many training runs that end each draw and are never among its training runs.
+Coarse runs with the parameters of a test run are never
 among them; they are used for the column "from a coarse run of the query" alone, where each prediction starts from its
 own. Everything is chosen by folds over the fine runs, test runs are asked once. `cost` is what a coarse run costs
 against a fine one: with it the table says how many fine runs alone would have the same error, and below which cost of a
@@ -20,6 +23,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,9 +36,10 @@ from crashkit.selection import runs_of
 from surrogates.data.campaign import Campaign, CoarseRuns, RunByRun
 from surrogates.data.samples import LevelRuns, Notes
 from surrogates.models.pod_regression import PodFit, fit_pod_regression, from_coarse_run, with_coarse
-from surrogates.regression.beneath import ALONE
+from surrogates.regression.beneath import ALONE, twins
 from surrogates.settings import Settings
 from surrogates.settings import settings as all_settings
+from surrogates.surrogate import Surrogate
 
 # Fine runs from which on draws are fewer: half of them, then one.
 _SOME, _MANY = 16, 48
@@ -66,11 +71,93 @@ class Chosen:
         return out
 
 
+class Fitted(Protocol):
+    """A model of some fine runs, with coarse runs beneath or without.
+
+    folds, way  error, m, in cross-validation over the fine runs, and how coarse runs are used
+    """
+
+    folds: float
+    way: str
+
+    def said(self, one: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float32]:
+        """(state, node, 3), m, of a run with parameters (parameter,)."""
+        ...
+
+    def from_run(
+        self,
+        one: NDArray[np.float64],
+        seen: NDArray[np.float32],
+        seen_time: NDArray[np.float64],
+        time: NDArray[np.float64],
+    ) -> NDArray[np.float32]:
+        """The same from its coarse run (state, coarse node, 3), m, where the model takes it."""
+        ...
+
+
+@dataclass(frozen=True)
+class OfPod:
+    """POD-GPR: physics and modes are chosen once, whatever coarse runs there are."""
+
+    fit: PodFit
+    folds: float = np.nan
+    way: str = ALONE
+
+    def said(self, one: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float32]:
+        out: NDArray[np.float32] = self.fit.registration.undo(self.fit.core.displacement, one[None], time)[0]
+        return out
+
+    def from_run(
+        self,
+        one: NDArray[np.float64],
+        seen: NDArray[np.float32],
+        seen_time: NDArray[np.float64],
+        time: NDArray[np.float64],
+    ) -> NDArray[np.float32]:
+        if self.fit.core.base is None:
+            return self.said(one, time)
+        return from_coarse_run(self.fit.core, self.fit.registration, one[None], seen, seen_time, time)
+
+
+@dataclass(frozen=True)
+class OfCascade:
+    """The cascade's finest level on the full mesh."""
+
+    surrogate: Surrogate
+
+    @property
+    def folds(self) -> float:
+        names, errors = list(self.surrogate.level_names), self.surrogate.record.errors
+        return errors.get(f"{names[-1]}, lifted to the full mesh", errors[names[-1]])
+
+    @property
+    def way(self) -> str:
+        return str(self.surrogate.record.coarse.get("way", ALONE))
+
+    def said(self, one: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float32]:
+        return self.surrogate.predict_full(one, time)
+
+    def from_run(
+        self,
+        one: NDArray[np.float64],
+        seen: NDArray[np.float32],
+        seen_time: NDArray[np.float64],
+        time: NDArray[np.float64],
+    ) -> NDArray[np.float32]:
+        if not self.surrogate.takes_coarse():
+            return self.said(one, time)
+        return self.surrogate.predict_from_coarse(one, seen, seen_time, time, full=True)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("fine", type=Path)
     parser.add_argument("coarse", type=Path)
     parser.add_argument("--test", required=True, help="fine runs that choose nothing, such as 96:108")
+    parser.add_argument("--model", default="pod-gpr", choices=["pod-gpr", "mh"], help="what is trained")
+    parser.add_argument(
+        "--fresh", type=int, default=0, help="ask so many fresh training runs in place of the test runs"
+    )
     parser.add_argument("--runs", default="8,12,16,24,48,96", help="numbers of fine runs")
     parser.add_argument("--coarse-runs", default="24,48,96,0", help="numbers of coarse runs; 0: all")
     parser.add_argument("--cost", type=float, default=0.19, help="cost of a coarse run against a fine one")
@@ -80,8 +167,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("-o", "--output", type=Path, help="where the table goes as Markdown; default: the terminal")
     options = parser.parse_args(arguments)
     counts, below = ([int(n) for n in text.split(",")] for text in (options.runs, options.coarse_runs))
-    settings = all_settings("pod-gpr", None, None, [options.set])
-    bench = Bench(source_of(options.fine), source_of(options.coarse), options.test, settings)
+    settings = all_settings(options.model, None, None, [options.set])
+    bench = Bench(source_of(options.fine), source_of(options.coarse), options.test, settings, options.fresh)
     total = len(bench.coarse.campaign.parameters)
     below = sorted({min(number or total, total) for number in below})
     found: dict[tuple[int, int | None], Cell] = {}
@@ -120,20 +207,32 @@ def draws(count: int, most: int) -> int:
 class Bench:
     """Fine and coarse runs, and the test runs with their coarse runs."""
 
-    def __init__(self, fine: Source, coarse: Source, test: str, settings: Settings) -> None:
-        self.settings = settings
+    def __init__(self, fine: Source, coarse: Source, test: str, settings: Settings, fresh: int = 0) -> None:
+        self.settings, self.fresh = settings, fresh
         self.campaign = open_campaign(fine, test, symmetry=True, odd=settings.physics.odd or ())
         self.coarse = coarse_runs(coarse.path or coarse.name, self.campaign, fine)
+        self.coarse_every = open_campaign(coarse)
         with open_dataset(fine.name) as opened:
             place = runs_of([str(n) for n in opened["sim"].values], test)
             tested = opened.isel(sim=place)
             self.parameters = np.stack([tested[n].values for n in self.campaign.parameter_names], axis=1).astype(float)
-            self.truth = [tested["displacement"].isel(sim=k).values for k in range(len(place))]
-        self.own = self._coarse_of_queries(coarse)
+            self.truth = [] if fresh else [tested["displacement"].isel(sim=k).values for k in range(len(place))]
+        self.own = self._coarse_of_queries()
 
-    def _coarse_of_queries(self, coarse: Source) -> list[NDArray[np.float32] | None]:
-        """Displacements of the coarse run of each test run; None without one."""
-        every = open_campaign(coarse)
+    def _asked(self, runs: NDArray[np.int64]) -> None:
+        """From now on these training runs are asked, which are kept from the training with their coarse runs."""
+        field = LevelRuns(self.campaign, 0, self.settings, Notes())
+        self.parameters = self.campaign.parameters[runs]
+        self.truth = []
+        for run in runs:
+            there = field.there(int(run))
+            states = field.read(int(run))
+            self.truth.append(states if there is None else np.where(there[..., None], states, np.float32(np.nan)))
+        self.own = self._coarse_of_queries()
+
+    def _coarse_of_queries(self) -> list[NDArray[np.float32] | None]:
+        """Displacements of the coarse run of each run that is asked; None without one."""
+        every = self.coarse_every
         order = [every.parameter_names.index(n) for n in self.campaign.parameter_names]
         runs = LevelRuns(every, 0, self.settings, Notes())
         out: list[NDArray[np.float32] | None] = []
@@ -144,59 +243,66 @@ class Bench:
 
     def row(self, count: int, below: Sequence[int], draw: int) -> Row:
         """Errors of `count` fine runs alone, and with each number of coarse runs."""
-        started, notes = time.perf_counter(), Notes()
+        started = time.perf_counter()
         order = np.random.default_rng(draw).permutation(len(self.campaign.parameters))
-        chosen = np.sort(order[:count])
-        campaign = some_runs(self.campaign, chosen)
-        alone = fit_pod_regression(campaign, self.settings, np.arange(count), notes)
-        error = float(np.nanmean([self._error(self._said(alone, one), k) for k, one in enumerate(self.parameters)]))
-        judged = None
-        rest = np.random.default_rng(1000 + draw).permutation(len(self.coarse.campaign.parameters))
+        rest = np.arange(len(self.coarse.campaign.parameters))
+        if self.fresh:
+            order, asked = order[: -self.fresh], order[-self.fresh :]
+            self._asked(asked)
+            same = twins(self.parameters, self.coarse.campaign.parameters)
+            rest = np.setdiff1d(rest, same[same >= 0])
+        campaign = some_runs(self.campaign, np.sort(order[:count]))
+        rest = np.random.default_rng(1000 + draw).permutation(rest)
+        alone = self._trained(campaign, None, None)
+        error = self._mean([alone.said(one, self.campaign.time) for one in self.parameters])
         print(
             f"{count} fine runs, draw {draw}: {1e3 * error:.2f} mm ({time.perf_counter() - started:.0f} s)", flush=True
         )
+        judged = alone.folds
         for number in below:
             runs = np.sort(rest[:number])
-            with_them = with_coarse(alone, self._some_coarse(runs), self.settings, Notes())
-            assert with_them.coarse is not None
-            folds, way = with_them.coarse.errors, with_them.coarse.way
-            judged = folds.get(ALONE) if judged is None else judged
-            test = float(
-                np.nanmean([self._error(self._said(with_them, one), k) for k, one in enumerate(self.parameters)])
+            them = self._trained(
+                campaign, CoarseRuns(some_runs(self.coarse.campaign, runs), self.coarse.to_fine), alone
             )
-            itself = float(np.nanmean([self._from_itself(with_them, k) for k in range(len(self.parameters))]))
-            print(f"  {len(runs)} coarse: {1e3 * test:.2f} mm, from itself {1e3 * itself:.2f} ({way})", flush=True)
-            yield number, {"test": test, "folds": folds.get(way, np.nan), "itself": itself, "ways": way}
-        yield (
-            None,
-            {"test": error, "folds": np.nan if judged is None else judged, "itself": error, "ways": ALONE},
-        )
+            if isinstance(them, OfPod) and them.fit.coarse is not None and np.isnan(judged):
+                judged = them.fit.coarse.errors.get(ALONE, np.nan)
+            test = self._mean([them.said(one, self.campaign.time) for one in self.parameters])
+            itself = self._mean([self._from_run(them, k) for k in range(len(self.parameters))])
+            print(f"  {len(runs)} coarse: {1e3 * test:.2f} mm, from itself {1e3 * itself:.2f} ({them.way})", flush=True)
+            yield number, {"test": test, "folds": them.folds, "itself": itself, "ways": them.way}
+        yield None, {"test": error, "folds": judged, "itself": error, "ways": ALONE}
 
-    def _some_coarse(self, runs: NDArray[np.int64]) -> CoarseRuns:
-        return CoarseRuns(some_runs(self.coarse.campaign, runs), self.coarse.to_fine)
+    def _trained(self, campaign: Campaign, coarse: CoarseRuns | None, alone: Fitted | None) -> Fitted:
+        """A model of the runs of `campaign`, over `coarse` ones; what was chosen for `alone` stays where it can."""
+        if self.settings.model == "mh":
+            from surrogates.training.train import train_surrogate
 
-    def _said(self, fit: PodFit, one: NDArray[np.float64]) -> NDArray[np.float32]:
-        out: NDArray[np.float32] = fit.registration.undo(fit.core.displacement, one[None], self.campaign.time)[0]
-        return out
+            return OfCascade(train_surrogate(replace(campaign, coarse=coarse), self.settings))
+        if coarse is None or not isinstance(alone, OfPod):
+            return OfPod(fit_pod_regression(campaign, self.settings, np.arange(len(campaign.parameters)), Notes()))
+        fit = with_coarse(alone.fit, coarse, self.settings, Notes())
+        assert fit.coarse is not None
+        return OfPod(fit, fit.coarse.errors.get(fit.coarse.way, np.nan), fit.coarse.way)
 
-    def _from_itself(self, fit: PodFit, k: int) -> float:
-        """The error of a test run, from its own coarse run where there is one and the model takes it."""
+    def _from_run(self, fit: Fitted, k: int) -> NDArray[np.float32]:
+        """A run that is asked, from its own coarse run where there is one."""
         seen, one = self.own[k], self.parameters[k]
-        if seen is None or fit.core.base is None:
-            return self._error(self._said(fit, one), k)
-        time = self.coarse.campaign.time
-        return self._error(from_coarse_run(fit.core, fit.registration, one[None], seen, time, self.campaign.time), k)
+        if seen is None:
+            return fit.said(one, self.campaign.time)
+        return fit.from_run(one, seen, self.coarse.campaign.time, self.campaign.time)
+
+    def _mean(self, said: Iterable[NDArray[np.float32]]) -> float:
+        return float(np.nanmean([self._error(one, k) for k, one in enumerate(said)]))
 
     def _error(self, said: NDArray[np.float32], k: int) -> float:
         return float(np.nanmean(np.linalg.norm(said - self.truth[k], axis=-1)))
 
 
 def some_runs(campaign: Campaign, runs: NDArray[np.int64]) -> Campaign:
-    """The runs `runs` of `campaign`, on the full mesh."""
-    values = campaign.displacement(0)
+    """The runs `runs` of `campaign`."""
     return replace(
         campaign, parameters=campaign.parameters[runs], runs=tuple(campaign.runs[k] for k in runs),
-        displacement=lambda level: Chosen(values, runs), marked={}, targets=(), curves=(), alive=None,
+        displacement=lambda level: Chosen(campaign.displacement(level), runs), marked={}, targets=(), curves=(), alive=None,
     )  # fmt: skip
 
 

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from surrogates.storage.outline import Outline
     from surrogates.surrogate import Surrogate
 
+# How the record names what coarse runs are worth on a level.
+_ON = "coarse runs on "
+
 
 def kind_of(path: str | Path) -> Literal["model", "report", "dataset"]:
     """What is stored at `path`, by the file that each kind of folder has; anything else is taken for a dataset."""
@@ -236,6 +239,9 @@ def describe_model(outline: Outline, path: Path) -> dict[str, Any]:
         "error_name": record.error_name,
         "choice": record.choice,
         "coarse": record.physics.get("coarse runs", ""),
+        "coarse_levels": {
+            name.removeprefix(_ON): told for name, told in record.physics.items() if name.startswith(_ON)
+        },
         "notes": list(record.notes),
     }
 

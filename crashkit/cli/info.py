@@ -118,6 +118,8 @@ def _print_model(found: dict[str, Any]) -> None:
     out.print(f"  runs        {', '.join(runs)}", markup=False)
     if found["coarse"]:
         out.print(f"  coarse runs {found['coarse']}", markup=False)
+    for level, told in found["coarse_levels"].items():
+        out.print(f"              on {level}: {told}", markup=False)
     span = f"{_shown(found['time_begin'], 's')} to {_shown(found['time_end'], 's')}"
     out.print(f"  states      {found['states']}, {span}; full mesh {found['nodes']} nodes", markup=False)
     _print_parameters(found["parameters"])

@@ -6,7 +6,7 @@ metres of node movement before slopes are fitted, and back afterwards.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from surrogates.regression.beneath import ALONE, Beneath, Courses3, FineRuns, Part, RunsBelow, put_beneath
+from surrogates.regression.beneath import ALONE, OF_QUERY, Beneath, Courses3, FineRuns, Part, RunsBelow, put_beneath
 from surrogates.regression.gaussian import Gaussian
 from surrogates.regression.latent_process import LatentProcess, OverCoarse, process_of
 from surrogates.training.latents import CoarseLatents, Latents
@@ -56,6 +56,22 @@ class OverLevel:
         assert self.itself is not None
         own = torch.arange(latents.own, device=left_out.device)
         return left_out + share * (self.itself - self.said[latents.part[: latents.own], own])
+
+    def tell(self, errors: Mapping[str, float], error: Callable[[Tensor], float]) -> None:
+        """Say the errors as the level's other choices say theirs: over all states, and not run by run.
+
+        Parameters
+        ----------
+        errors
+            What was tried for the level, by name.
+        error
+            Of latent vectors (own run, state, latent), m.
+        """
+        known = self.found.errors
+        for way, name in ((ALONE, "process"), (self.found.way, "process over coarse runs")):
+            known[way] = errors.get(name, known[way])
+        if OF_QUERY in known and self.itself is not None:
+            known[OF_QUERY] = error(self.itself)
 
     def reject(self) -> None:
         """The fine runs alone are kept after all."""

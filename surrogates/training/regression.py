@@ -219,6 +219,7 @@ def choose_regression(
         more = _tried(networks, over.said, [share for share in shares if share > 0], latents, level.scale)
         told |= {f"{named(share)}{_OVER}": error for share, error in more[1].items()}
         of_them = min(more[1], key=lambda share: more[1][share])
+        over.tell(told, lambda z: level.scale * _error(z, latents))
         # A network may rest on a level below that takes coarse runs already; then both do, and this one alone can start from
         # a coarse run of the query.
         margin = WORTH_IT if latents.coarse_below else -WORTH_IT

@@ -41,6 +41,7 @@ MODELS = {
         "levels=[2, 1]",
         "seeds=2",
     ],
+    "coarse": ["level.epochs=2", "level.regression=mean"],
     "pod-gpr": [],
 }
 
@@ -50,7 +51,8 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Su
     """Small models of a plate, as folders and loaded."""
     home, out = tmp_path_factory.mktemp("models"), {}
     for name, told in MODELS.items():
-        surrogate = train_surrogate(plate.campaign(10), settings(name if name == "pod-gpr" else "mh", overrides=told))
+        campaign = plate.waving_campaign(10) if name == "coarse" else plate.campaign(10)
+        surrogate = train_surrogate(campaign, settings(name if name == "pod-gpr" else "mh", overrides=told))
         save(surrogate, home / name)
         out[name] = (home / name, surrogate)
     return out
