@@ -171,6 +171,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     bench = Bench(source_of(options.fine), source_of(options.coarse), options.test, settings, options.fresh)
     total = len(bench.coarse.campaign.parameters)
     below = sorted({min(number or total, total) for number in below})
+    asked = f"{options.fresh} fresh training runs" if options.fresh else "test runs"
     found: dict[tuple[int, int | None], Cell] = {}
     for count in counts:
         for draw in range(draws(count, options.draws)):
@@ -178,10 +179,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 cell = found.setdefault((count, number), Cell())
                 for name, value in said.items():
                     getattr(cell, name).append(value)
-            lines = list(tables(found, options.cost))
+            lines = list(tables(found, options.cost, asked))
             if options.output:  # what is known so far is kept, whatever happens
                 options.output.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    print("\n".join(tables(found, options.cost)))
+    print("\n".join(tables(found, options.cost, asked)))
 
 
 Row = Iterable[tuple[int | None, dict[str, float | str]]]
@@ -306,15 +307,15 @@ def some_runs(campaign: Campaign, runs: NDArray[np.int64]) -> Campaign:
     )  # fmt: skip
 
 
-def tables(found: dict[tuple[int, int | None], Cell], cost: float) -> Iterable[str]:
-    """Markdown: errors, then costs."""
+def tables(found: dict[tuple[int, int | None], Cell], cost: float, asked: str = "test runs") -> Iterable[str]:
+    """Markdown: errors on the runs that are `asked`, then costs."""
     counts = sorted({count for count, _ in found})
     below = list(dict.fromkeys(number for _, number in found if number is not None))
     alone = {count: float(np.mean(found[count, None].test)) for count in counts if (count, None) in found}
     for title, part in (
-        ("Error on test runs, mm", "test"),
+        (f"Error on {asked}, mm", "test"),
         ("Error in cross-validation over the fine runs, mm", "folds"),
-        ("Error on test runs, mm, from a coarse run of the query", "itself"),
+        (f"Error on {asked}, mm, from a coarse run of the query", "itself"),
     ):
         yield f"{title}:"
         yield ""

@@ -25,6 +25,7 @@ PODNN = Kind("podnn", "podnn", (*EPOCHS, *PHYSICS))
 PODNN_WIDE = Kind("podnn-wide", "podnn", (*EPOCHS, *PHYSICS, f"level.latent={LATENT}"), f"with {LATENT} modes")
 MH = Kind("mh", "mh", (*CASCADE, *PHYSICS))
 MH_WITHOUT = Kind("mh-without-physics", "mh", (*CASCADE, *WITHOUT), "without physics")
+MH_COARSE = Kind("mh-with-coarse-runs", "mh", (*CASCADE, *PHYSICS), "with coarse runs", coarse=True)
 # On the full mesh an epoch costs many times one on 80 nodes; these two get about as many seconds as the cascade.
 AENN = Kind("aenn", "aenn", ("level.epochs=30",))
 GAENN = Kind("gaenn", "gaenn", ("level.epochs=6",))
@@ -32,5 +33,5 @@ GAENN = Kind("gaenn", "gaenn", ("level.epochs=6",))
 PLAN = Plan(
     "bumper_fine", RUNS, TRAIN, NODES,
     table=(POD_GPR, POD_GPR_WITHOUT, POD_GPR_COARSE, POD_RBF, PODNN, PODNN_WIDE, MH, AENN, GAENN),
-    curves=(POD_GPR, POD_GPR_WITHOUT, POD_GPR_COARSE, MH, MH_WITHOUT), sizes=SIZES, unit="mm", coarse="bumper_coarse",
+    curves=(POD_GPR, POD_GPR_WITHOUT, POD_GPR_COARSE, MH, MH_WITHOUT, MH_COARSE), sizes=SIZES, unit="mm", coarse="bumper_coarse",
 )  # fmt: skip

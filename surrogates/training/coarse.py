@@ -76,10 +76,14 @@ def note_coarse(record: Record, coarse: CoarseRuns, found: CoarseFit) -> None:
 
 
 def note_coarse_levels(record: Record, coarse: CoarseRuns, levels: Mapping[str, Beneath]) -> None:
-    """The same for the levels of a cascade, the finest one last, by name; with several seeds each has a name of its own."""
+    """The same for the levels of a cascade, the finest one last, by name; with several seeds each has a name of its own.
+
+    What stands for the whole is the finest level that uses them.
+    """
     if not levels:
         return
-    finest = list(levels.values())[-1]
+    using = [found for found in levels.values() if found.way != ALONE]
+    finest = (using or list(levels.values()))[-1]
     record.coarse = {
         **_about(coarse, finest.runs, finest.twins), **_of_level(finest),
         "levels": {name: _of_level(found) for name, found in levels.items()},
