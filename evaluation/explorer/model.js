@@ -122,17 +122,20 @@ function makeRegistration(told, parameters) {
   return {inputs, clock};
 }
 
-// A Gaussian process over whole courses of POD coefficients: coefficients = mean + k(x) pull, states = modes coefficients.
+// A Gaussian process over whole courses of POD coefficients: coefficients = mean + k(x) pull, states = modes coefficients. Over
+// coarse runs it is a sum of such processes; the first one is that of the fine runs, which says the deviation.
 function makeProcess(spec, arrays) {
   const {x, mix, mean, pull, modes, grid, low, high, inverse} = Object.fromEntries(
     ['x', 'mix', 'mean', 'pull', 'modes', 'grid', 'low', 'high', 'inverse'].map((name) => [name, arrays[spec.arrays[name]]]));
   const {variance, slope, noise} = spec.kernel, r = spec.modes, samples = spec.samples, kept = spec.kept;
+  const terms = [{x, mix, mean, pull, kernel: spec.kernel, samples}, ...spec.added.map((term) => ({...term, ...Object.fromEntries(
+    Object.entries(term.arrays).map(([name, key]) => [name, arrays[key]]))}))];
   function scaled(inputs) {
     const q = [];
     inputs.forEach((v, k) => { if (kept[k]) q.push(2 * (v - low[k]) / (high[k] - low[k]) - 1); });
     return q;
   }
-  function covariances(q) {
+  function covariances(q, {x, mix, kernel: {variance, slope}, samples} = terms[0]) {
     const d = q.length, out = new Float64Array(samples);
     for (let i = 0; i < samples; i++) {
       let away = 0, dot = 0;
@@ -147,11 +150,14 @@ function makeProcess(spec, arrays) {
     return out;
   }
   function prepare(inputs) {
-    const course = Float64Array.from(mean);
-    covariances(scaled(inputs)).forEach((k, i) => {
-      const from = i * course.length;
-      for (let j = 0; j < course.length; j++) course[j] += k * pull[from + j];
-    });
+    const course = new Float64Array(mean.length), q = scaled(inputs);
+    for (const term of terms) {
+      for (let j = 0; j < course.length; j++) course[j] += term.mean[j];
+      covariances(q, term).forEach((k, i) => {
+        const from = i * course.length;
+        for (let j = 0; j < course.length; j++) course[j] += k * term.pull[from + j];
+      });
+    }
     return course;
   }
   function deviation(inputs) {  // what the process believes its standard deviation to be, in units of the outputs' spread

@@ -98,8 +98,6 @@ def _process(
 ) -> dict[str, Any]:
     if not isinstance(core.machine, Gaussian) or core.inputs != "trajectory":
         raise SurrogateError("only Gaussian processes over whole runs have a form for a browser; train pod-gpr or mh")
-    if core.base is not None:
-        raise SurrogateError("coarse runs beneath fine ones have no form for a browser; train pod-gpr without --coarse")
     known = core.data.values.reshape(len(core.data.values), -1).astype(np.float64)
     mean, pull = core.machine.expanded(known)
     inverse = core.machine.inverse()
@@ -109,18 +107,37 @@ def _process(
     }  # fmt: skip
     for key, values in named.items():
         arrays[prefix + key] = np.asarray(values, np.float32 if key == "modes" else np.float64)
-    kernel = core.machine.kernel
-    coefficients = np.abs(known.reshape(len(known), -1, core.modes.shape[1])).max(axis=(0, 1))
+    base = core.base
+    coefficients = np.abs(core.courses).max(axis=(0, 1)).astype(np.float64)
     largest = np.abs(core.modes).max(axis=0)
     allowed = SHARE * float((coefficients * largest).max())
     steps[f"{prefix}modes"] = allowed / np.maximum(coefficients, 1e-30)
-    weights = np.linalg.norm(kernel(core.machine.x, core.machine.x), axis=1).max()
-    steps[f"{prefix}pull"] = allowed / np.maximum(largest * weights, 1e-30)
+
+    def rounded(machine: Gaussian) -> NDArray[np.float64]:
+        """To what its pull may be rounded."""
+        weights = np.linalg.norm(machine.kernel(machine.x, machine.x), axis=1).max()
+        return np.asarray(allowed / np.maximum(largest * weights, 1e-30))
+
+    steps[f"{prefix}pull"] = rounded(core.machine)
+    added = []
+    of_base = [] if base is None else [*([base.beside] if base.beside else []), (base.process, base.values)]
+    for number, (machine, values) in enumerate(of_base):
+        mean, pull = machine.expanded(values.reshape(len(values), -1).astype(np.float64))
+        parts = {"x": machine.x, "mix": machine.kernel.mix, "mean": mean, "pull": pull}
+        names = {key: f"{prefix}added_{number}_{key}" for key in parts}
+        arrays.update({names[key]: np.asarray(part, np.float64) for key, part in parts.items()})
+        steps[names["pull"]] = rounded(machine)
+        added.append({"arrays": names, "kernel": _numbers(machine), "samples": len(machine.x)})
     return {
         "kind": "process", "arrays": {key: prefix + key for key in named},
-        "kernel": {"variance": float(kernel.variance), "slope": float(kernel.slope), "noise": float(kernel.noise)},
+        "kernel": _numbers(core.machine), "added": added,
         "modes": core.modes.shape[1], "samples": len(core.machine.x), "kept": (core.high > core.low).tolist(),
     }  # fmt: skip
+
+
+def _numbers(machine: Gaussian) -> dict[str, float]:
+    kernel = machine.kernel
+    return {"variance": float(kernel.variance), "slope": float(kernel.slope), "noise": float(kernel.noise)}
 
 
 def _registration(surrogate: Surrogate) -> dict[str, Any]:

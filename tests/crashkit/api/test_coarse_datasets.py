@@ -226,3 +226,35 @@ def test_a_study_names_its_coarse_runs(tmp_path: Path) -> None:
     study.write_text("dataset: fine.zarr\ntrain: {models: {pod-gpr: {coarse: coarse.zarr}}}\n")
     trained = next(step for step in study_steps(study) if "train" in step.line)
     assert f"--coarse {tmp_path / 'coarse.zarr'}" in trained.line
+
+
+def test_the_commands_of_a_cascade(tmp_path: Path) -> None:
+    below, fine, model = tmp_path / "coarse.zarr", tmp_path / "fine.zarr", tmp_path / "m"
+    dataset(5, range(30), output=below)
+    dataset(9, range(8), output=fine)
+    settings = (
+        "physics.clock=off", "physics.symmetry=off", "inputs.derived=off", "level.regression=process", "level.latent=6",
+    )  # fmt: skip
+    for command in (
+        ["coarsen", str(fine), "--nodes", "80,30"],
+        ["train", str(fine), "-o", str(model), "--coarse", str(below), *(x for s in settings for x in ("--set", s))],
+    ):
+        done = CliRunner().invoke(app, command)
+        assert done.exit_code == 0, done.output
+    assert "coarse runs on MH1: process" in " ".join(done.output.split())
+    below.rename(tmp_path / "elsewhere.zarr")
+    told = CliRunner().invoke(app, ["info", str(model)])
+    assert "on MH2: process" in " ".join(told.output.split()), told.output
+    truth = dataset(9, range(20, 21))["displacement"].values[0]
+    for level, name in ((1, "one.npz"), (None, "full.npz")):
+        said = CliRunner().invoke(
+            app,
+            ["predict", str(model), "--coarse-run", f"{tmp_path / 'elsewhere.zarr'}:run_20", "-o", str(tmp_path / name),
+             "--band", "0.9", *(["--level", str(level)] if level else [])],
+        )  # fmt: skip
+        assert said.exit_code == 0, said.output
+        found = np.load(tmp_path / name)
+        wanted = truth if level is None else truth[:, found["node"]]
+        assert (
+            np.linalg.norm(found["displacement"] - wanted, axis=-1).mean() < 0.1 * np.linalg.norm(truth, axis=-1).mean()
+        )

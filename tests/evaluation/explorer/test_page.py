@@ -43,6 +43,7 @@ MODELS = {
     ],
     "coarse": ["level.epochs=2", "level.regression=mean"],
     "pod-gpr": [],
+    "pod-gpr-coarse": [],
 }
 
 
@@ -51,8 +52,10 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Su
     """Small models of a plate, as folders and loaded."""
     home, out = tmp_path_factory.mktemp("models"), {}
     for name, told in MODELS.items():
-        campaign = plate.waving_campaign(10) if name == "coarse" else plate.campaign(10)
-        surrogate = train_surrogate(campaign, settings(name if name == "pod-gpr" else "mh", overrides=told))
+        campaign = plate.waving_campaign(10) if name.endswith("coarse") else plate.campaign(10)
+        model = "pod-gpr" if name.startswith("pod-gpr") else "mh"
+        surrogate = train_surrogate(campaign, settings(model, overrides=told))
+        assert surrogate.takes_coarse() == name.endswith("coarse")
         save(surrogate, home / name)
         out[name] = (home / name, surrogate)
     return out

@@ -131,9 +131,10 @@ def test_points_are_predicted_as_the_whole_mesh_is(helped: Surrogate) -> None:
     np.testing.assert_allclose(found, helped.predict(mu)[:, :, nodes], atol=1e-5)
 
 
-def test_a_page_with_sliders_says_that_it_cannot(helped: Surrogate) -> None:
-    with pytest.raises(SurrogateError, match="no form for a browser"):
-        browsable(helped, "m", "m_")
+def test_a_page_with_sliders_sums_the_processes(helped: Surrogate) -> None:
+    found = browsable(helped, "m", "m_")
+    assert [term["samples"] for term in found.about["added"]] == [10, 60]
+    assert all(name in found.arrays for term in found.about["added"] for name in term["arrays"].values())
 
 
 def test_other_models_refuse_coarse_runs() -> None:
