@@ -126,9 +126,14 @@ def train_surrogate(
     if by_folds:
         trainer = _registered(surrogate, trainer)
     _fit_curves(surrogate, campaign, settings, parts.training, wanted)
-    members = _fit_members(surrogate, trainer)
+    try:
+        members = _fit_members(surrogate, trainer)
+    except Diverged as error:
+        if error.surrogate is not None:
+            _note_coarse([(error.surrogate, trainer)])
+        raise
     if campaign.coarse is not None:
-        note_coarse_levels(surrogate.record, campaign.coarse, _coarse_said(members))
+        _note_coarse(members, surrogate.record)
     _judge(surrogate, members, watch)
     fit_beside(surrogate, campaign, settings, parts.training, notes)
     return surrogate
@@ -520,18 +525,17 @@ def _deviations(surrogate: Surrogate, members: Sequence[Member]) -> NDArray[np.f
     return core.deviation(spread)
 
 
-def _coarse_said(members: Sequence[Member]) -> dict[str, Beneath]:
-    """What folds said of coarse runs on each level, coarsest first; by seed where there are several."""
-    out = {}
+def _note_coarse(members: Sequence[Member], record: Record | None = None) -> None:
+    """Keep in the record what coarse runs are worth on each level, coarsest first; by seed where there are several."""
+    out: dict[str, Beneath] = {}
     for member, trainer in members:
         for name, number in member.level_names.items():
-            if not isinstance(trainer, FoldTrainer):
-                continue
-            over = trainer.chosen[number].coarse
-            if over is not None:
-                label = name if len(members) == 1 else f"{name}, seed {trainer.settings.seed}"
-                out[label] = over.found
-    return out
+            chosen = trainer.chosen.get(number) if isinstance(trainer, FoldTrainer) else None
+            if chosen is not None and chosen.coarse is not None:
+                out[name if len(members) == 1 else f"{name}, seed {trainer.settings.seed}"] = chosen.coarse.found
+    coarse = members[0][1].campaign.coarse
+    if coarse is not None:
+        note_coarse_levels(record or members[0][0].record, coarse, out)
 
 
 def _choices(members: Sequence[Member]) -> dict[str, str]:

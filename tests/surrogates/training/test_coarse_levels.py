@@ -25,7 +25,9 @@ from surrogates.storage.export import export
 from surrogates.storage.folder import load, save
 from surrogates.surrogate import Surrogate
 from surrogates.training import train
+from surrogates.training.by_folds import FoldTrainer
 from surrogates.training.checkpoints import Checkpoints
+from surrogates.training.loop import Diverged
 from surrogates.training.train import train_surrogate
 
 OFF = [
@@ -182,6 +184,23 @@ def test_interrupted_it_keeps_the_levels_over_coarse_runs_and_goes_on(tmp_path: 
     other = replace(campaign.coarse, campaign=replace(campaign.coarse.campaign, checksum="beef"))
     with pytest.raises(SurrogateError, match="other coarse runs"):
         Checkpoints(tmp_path / "other", chosen, replace(campaign, coarse=other), resume=True)
+
+
+def test_where_a_finer_level_diverges_what_is_kept_says_its_coarse_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = FoldTrainer.fit
+
+    def fit(self: FoldTrainer, objective: Any, of_level: Any, name: str, seed: int) -> Any:
+        if name == "MH1":
+            raise Diverged("MH1: the loss is not finite")
+        return real(self, objective, of_level, name, seed)
+
+    monkeypatch.setattr(FoldTrainer, "fit", fit)
+    with pytest.raises(Diverged) as stopped:
+        trained(plate.seen_coarsely, "level.regression=mean", runs=8)
+    kept = stopped.value.surrogate
+    assert kept is not None
+    assert kept.takes_coarse()
+    assert list(kept.record.coarse["levels"]) == ["MH2"]
 
 
 @pytest.mark.parametrize(
