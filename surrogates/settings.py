@@ -153,12 +153,16 @@ class TransferSettings(_Frozen):
         `input`: the output of the coarse regression is a further input; `residual`: it is also added to the result.
     epochs
         Fraction of `level.epochs` used by a level that starts from a coarser one.
+    lifting
+        From a level to the full mesh: `static`, the barycentric U of the paper; `auto`, a map learnt from the training
+        runs where runs left out show that it is better.
     """
 
     upsampling: Literal["static", "sparse", "linear"] = "linear"
     encoder: Literal["add", "concat"] = "add"
     mlp: Literal["input", "residual"] = "input"
     epochs: Annotated[float, Field(gt=0, le=1)] = 1.0
+    lifting: Literal["auto", "static"] = "auto"
 
 
 class InputSettings(_Frozen):
@@ -428,6 +432,7 @@ _PAPER: dict[str, Any] = {
     "validation": {"measure": "paper"},
     "inputs": {"derived": "off"},
     "physics": {"clock": "off", "symmetry": "off"},
+    "transfer": {"lifting": "static"},
 }
 _PRESETS: Mapping[str, dict[str, Any]] = {"fast": _FAST, "paper": _PAPER}
 _OF_MODEL: Mapping[str, dict[str, Any]] = {

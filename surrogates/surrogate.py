@@ -95,6 +95,10 @@ class Surrogate:
         self.curves: dict[str, Curve] = {}
         self._upward: dict[int, sparse.csr_matrix] = {}
 
+    def with_graphs(self, graphs: Graphs) -> None:
+        """Take over other maps of the same levels to the full mesh."""
+        self.graphs, self._upward = graphs, {}
+
     def untrained(self) -> Surrogate:
         """Another one for the same data, behind the same registration, with nothing trained yet."""
         from surrogates.models.cascade import Cascade
@@ -262,14 +266,20 @@ class Surrogate:
         out = self.curves[name].predict(self.registration, values)
         return np.asarray(out[0] if np.ndim(parameters) == 1 else out)
 
-    def lift(self, states: NDArray[np.float32], level: int) -> NDArray[np.float32]:
-        """(..., node of `level`, 3) -> (..., node of the full mesh, 3)"""
+    def lift(
+        self, states: NDArray[np.float32], level: int, to_full: sparse.csr_matrix | None = None
+    ) -> NDArray[np.float32]:
+        """(..., node of `level`, 3) -> (..., node of the full mesh, 3); `to_full` replaces the model's own map."""
         if level == 0:
             return states
         import torch
 
         flat = torch.from_numpy(np.asarray(states, np.float32).reshape(-1, *states.shape[-2:]))
-        return self._lifted(flat.transpose(0, 1), level).numpy().reshape(*states.shape[:-2], -1, 3)
+        if to_full is None:
+            rows = self._lifted(flat.transpose(0, 1), level).numpy()
+        else:
+            rows = np.asarray(lift(to_full, flat.numpy()))
+        return rows.reshape(*states.shape[:-2], -1, 3)
 
     def _lifted(self, states: Tensor, level: int) -> Tensor:
         """(node of `level`, b, 3) -> (b, node of the full mesh, 3), a view: transposing it costs more than lifting."""

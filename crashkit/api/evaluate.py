@@ -37,6 +37,9 @@ if TYPE_CHECKING:
 
     GivenModel = Trained | Surrogate | str | Path
 
+# Largest difference of weights below which two maps to the full mesh are the same: stored ones are rounded.
+_SAME_WEIGHT = 1e-5
+
 
 def evaluate(
     dataset: str | Path | xr.Dataset,
@@ -539,13 +542,16 @@ def as_model(surrogate: Surrogate, folder: Path, reference: Reference) -> Compar
 
 
 def _own_mesh(surrogate: Surrogate, folder: Path, name: str, level: int, reference: Reference) -> Level | None:
-    """The level's own mesh where training refined it; None where it is the dataset's."""
+    """The level as training left it, refined or with a learnt map to the full mesh; None where it is the dataset's."""
     import numpy as np
 
     from evaluation.errors import EvaluationError
 
-    if level == 0 or np.array_equal(surrogate.graphs.kept(level), reference.level(level).kept):
+    if level == 0:
         return None
+    if np.array_equal(surrogate.graphs.kept(level), reference.level(level).kept):
+        apart = surrogate.graphs.to_full(level) - reference.level(level).to_full
+        return surrogate.graphs[level] if abs(apart).max() > _SAME_WEIGHT else None
     if surrogate.settings.refinement.adaptive:
         return surrogate.graphs[level]
     raise EvaluationError(

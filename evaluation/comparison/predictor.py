@@ -24,7 +24,8 @@ class Predictor(Protocol):
     level
         The mesh level it predicts on; 0 is the full mesh.
     mesh
-        Its coarse mesh where that is not the dataset's level, as after adaptive refinement; else None.
+        Its coarse mesh where that, or its map to the full mesh, is not the dataset's, as after adaptive refinement or with a
+        learnt map; else None.
     n_parameters
         Trained numbers, the budget shown beside the errors.
     n_latent

@@ -117,6 +117,12 @@ class Evaluation(Described):
         """Mean error of lifting the truth itself from `level`, m; 0 on the full mesh."""
         return 0.0 if level == 0 else float(masked_mean(np.array([r.lifting[level] for r in self.runs])))
 
+    def lifting_of(self, entry: Entry) -> float:
+        """The same by the map of `entry`, which may have learnt a better one."""
+        own = [run.scores[key].lifting for key in entry.keys for run in self.runs]
+        learnt = [each for each in own if each is not None]
+        return float(masked_mean(np.array(learnt))) if learnt else self.lifting(entry.level)
+
     def nodes(self, entry: Entry) -> int:
         """Number of nodes that `entry` predicts on."""
         mesh = mesh_of(self.reference, self.predictor(entry))

@@ -58,6 +58,8 @@ class RunScore:
         What the sensors would see of the prediction; None without sensors.
     covered
         Share of nodes and states within the predictor's own band of `NOMINAL`; NaN where it gives none.
+    lifting
+        (state,) error of lifting the truth itself by the predictor's own map; None where it has none.
     """
 
     e2: NDArray[np.float64]
@@ -74,6 +76,7 @@ class RunScore:
     parted: Parted
     watched: Watched | None = None
     covered: float = float("nan")
+    lifting: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -188,7 +191,7 @@ def _score(
     own = last_seen(truth) if mesh is None else last_seen(truth[:, mesh.kept])
     asked = Tally(gathering, reference.n_nodes)
     again = Tally(gathering.only(_LEVELS), reference.n_nodes, brief=True)
-    parted, watched, within = [], [], np.zeros(2, np.int64)
+    parted, watched, within, lifting = [], [], np.zeros(2, np.int64), []
     position = reference.position_of(run)
     for states in state_blocks(*truth.shape[:2]):
         count = states.stop - states.start
@@ -202,6 +205,9 @@ def _score(
             whole = len(distance) > 0 and not bool(np.isnan(distance.sum()))
             watched.append(watch(reference, sensors, run, prediction, motions[1] if whole else None))
         again.add(truth[states], full_field(reference, predictor, predictor.reconstruct(own[states]), count))
+        if predictor.mesh is not None:
+            lifted = full_field(reference, predictor, own[states], count)
+            lifting.append(mean_node_error(node_distance(truth[states], lifted)))
     return RunScore(
         e2=asked.over_time("e2"),
         reconstruction=again.over_time("e2"),
@@ -217,6 +223,7 @@ def _score(
         parted=joined(parted),
         watched=joined(watched) if watched else None,
         covered=within[0] / within[1] if within[1] else float("nan"),
+        lifting=np.concatenate(lifting) if lifting else None,
     )
 
 

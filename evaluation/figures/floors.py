@@ -127,7 +127,7 @@ def select(evaluation: Evaluation) -> Floors | None:
             evaluation.predictor(e).n_latent,
             evaluation.scores[e.label].mean,
             evaluation.scores[e.label].reduction,
-            evaluation.lifting(e.level),
+            evaluation.lifting_of(e),
             tuple(float(s) for s in evaluation.scores[e.label].of_seeds),
         )
         for e in evaluation.entries

@@ -22,7 +22,7 @@ class Performance:
     peak                largest error of any node at any time
     reduction           error of encoding and decoding the truth
     pod_floor           projection on as many modes as the model has latent numbers
-    lifting             cost of the static upsampling alone
+    lifting             cost of the model's own map from its level to the full mesh alone
     covered             share of nodes and states of the test runs within the model's own 90 % band; NaN without one
 
     Attributes
@@ -80,7 +80,7 @@ def performance(evaluation: Evaluation) -> list[Performance]:
                 peak_cm=float(scores.peak_value.max()) * CM,
                 reduction_cm=scores.reduction * CM,
                 pod_floor_cm=evaluation.floor_at(predictor.n_latent) * CM,
-                lifting_cm=evaluation.lifting(entry.level) * CM,
+                lifting_cm=evaluation.lifting_of(entry) * CM,
                 covered=_mean(scores.covered.ravel().tolist()),
                 latent=predictor.n_latent,
                 parameters=predictor.n_parameters,

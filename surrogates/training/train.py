@@ -7,6 +7,7 @@ import itertools
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from fnmatch import fnmatchcase
 
 import numpy as np
@@ -34,6 +35,7 @@ from surrogates.training.beside import check_targets, fit_beside
 from surrogates.training.by_folds import FoldTrainer, chooses_by_folds
 from surrogates.training.coarse import check_coarse, note_coarse, note_coarse_levels
 from surrogates.training.coarse_latents import CoarseFields
+from surrogates.training.lifting import Lifts, learn_lifts
 from surrogates.training.loop import Diverged, Epoch, Keeper, device_of
 from surrogates.training.members import averaged, fits_together, trainer_of
 from surrogates.training.refinement import Refined
@@ -134,7 +136,8 @@ def train_surrogate(
         raise
     if campaign.coarse is not None:
         _note_coarse(members, surrogate.record)
-    _judge(surrogate, members, watch)
+    lifts = _learnt_lifts(surrogate, members[0][1])
+    _judge(surrogate, members, watch, lifts)
     fit_beside(surrogate, campaign, settings, parts.training, notes)
     return surrogate
 
@@ -410,12 +413,43 @@ def _fit_cascade(surrogate: Surrogate, trainer: Trainer) -> None:
 _Judged = tuple[int, NDArray[np.float32]]
 
 
-def _judge(surrogate: Surrogate, members: Sequence[Member], watch: Watch | None = None) -> None:
-    """Note errors e2 (m) over runs that were left out, and calibrate the bands on them: on own nodes, and lifted."""
+def _learnt_lifts(surrogate: Surrogate, trainer: Trainer) -> Lifts | None:
+    """Maps from the levels to the full mesh, as far as training runs give better ones; they are put on the surrogate."""
+    settings, campaign = trainer.settings, trainer.judged_campaign
+    full = _full_field(trainer)
+    if settings.transfer.lifting == "static" or settings.refinement.adaptive or campaign.points is None or full is None:
+        return None
+    runs = len(campaign.parameters)
+    training = np.arange(runs) if isinstance(trainer, FoldTrainer) else trainer.split.training
+    part = np.full(runs, -1)
+    if isinstance(trainer, FoldTrainer):
+        part = trainer.part[:runs]
+    else:
+        part[training] = np.random.default_rng(settings.seed).permutation(len(training)) % settings.validation.folds
+    numbers = list(surrogate.level_names.values())
+    lifts = learn_lifts(full, surrogate.graphs, numbers, part, training, campaign.points, campaign.known)
+    surrogate.with_graphs(lifts.put_on(surrogate.graphs))
+    if not isinstance(trainer, FoldTrainer):
+        # Runs that are judged were not learnt from.
+        return replace(lifts, part=np.full(runs, -1))
+    return lifts
+
+
+def _judge(
+    surrogate: Surrogate, members: Sequence[Member], watch: Watch | None = None, lifts: Lifts | None = None
+) -> None:
+    """Note errors e2 (m) over runs that were left out, and calibrate the bands on them: on own nodes, and lifted.
+
+    A run that was left out is lifted by maps that were learnt without it.
+    """
     trainer, record = members[0][1], surrogate.record
     if isinstance(trainer, FoldTrainer):
         record.choice = _choices(members)
-    elif not len(trainer.split.validation):
+    for name, number in surrogate.level_names.items():
+        if lifts is not None and (told := lifts.told(number)):
+            before = record.choice.get(name)
+            record.choice[name] = told if before is None else f"{before}; {told}"
+    if not isinstance(trainer, FoldTrainer) and not len(trainer.split.validation):
         trainer.notes.add("no runs were held out, so there is neither a validation error nor a band")
         return
     full = _full_field(trainer)
@@ -441,13 +475,13 @@ def _judge(surrogate: Surrogate, members: Sequence[Member], watch: Watch | None 
         def lifted(number: int = number) -> Iterator[_Judged]:
             for run, said in _left_out(members, number):
                 if full is not None:
-                    yield run, _off(_mean_of(said), full, run, lambda some: surrogate.lift(some, number))
+                    yield run, _off(_mean_of(said), full, run, _lifting(surrogate, number, lifts, run))
 
         _note(surrogate, trainer, name, (number, False), own(), deviations)
         if full is not None and number > 0:
             _note(surrogate, trainer, f"{name}, lifted to the full mesh", (number, True), lifted(), deviations)
         if surrogate.takes_coarse(number):
-            _judge_from_runs(surrogate, members, number, runs, full, deviations)
+            _judge_from_runs(surrogate, members, number, runs, full, deviations, lifts)
         record.errors[f"{name}, reduction alone"] = float(np.mean(reduced))
         if len(members) > 1:
             for (_, own_trainer), errors in zip(members, alone, strict=True):
@@ -456,7 +490,7 @@ def _judge(surrogate: Surrogate, members: Sequence[Member], watch: Watch | None 
 
 def _judge_from_runs(
     surrogate: Surrogate, members: Sequence[Member], number: int, runs: LevelRuns, full: LevelRuns | None,
-    deviations: NDArray[np.float64],
+    deviations: NDArray[np.float64], lifts: Lifts | None,
 ) -> None:  # fmt: skip
     """Bands of predictions that start from a coarse run of the query: on the level's own nodes, and lifted."""
     trainer = members[0][1]
@@ -467,12 +501,20 @@ def _judge_from_runs(
     def judged(field: LevelRuns, *, lifted: bool) -> Iterator[tuple[int, float, NDArray[np.float32]]]:
         for run, said in _left_out(members, number, from_coarse=True):
             if twin[run] >= 0:
-                up = (lambda some: surrogate.lift(some, number)) if lifted else (lambda some: some)
+                up = _lifting(surrogate, number, lifts, run) if lifted else (lambda some: some)
                 yield run, float(deviations[run]), _off(_mean_of(said), field, run, up)
 
     _note_from_runs(surrogate, trainer, (number, False), judged(runs, lifted=False))
     if full is not None and number > 0:
         _note_from_runs(surrogate, trainer, (number, True), judged(full, lifted=True))
+
+
+def _lifting(
+    surrogate: Surrogate, number: int, lifts: Lifts | None, run: int
+) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
+    """From the nodes of a level to the full mesh, by a map that has not seen the run."""
+    to_full = None if lifts is None else lifts.without(run, number)
+    return lambda states: surrogate.lift(states, number, to_full)
 
 
 def _left_out(

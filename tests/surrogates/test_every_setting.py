@@ -90,6 +90,7 @@ TABLE: dict[str, list[Line]] = {
     "transfer.encoder": [line("transfer.encoder=concat", on=FINE)],
     "transfer.mlp": [line("transfer.mlp=residual", on=FINE)],
     "transfer.epochs": [line("transfer.epochs=0.5", on=FINE)],
+    "transfer.lifting": [line("transfer.lifting=static", on=NONE)],
     "inputs.products": [line("inputs.products=true")],
     "inputs.angles": [line("inputs.angles=true")],
     "inputs.initial_state": [line("inputs.initial_state=true")],

@@ -181,10 +181,10 @@ def test_any_number_of_levels_and_states_can_be_asked_at_once() -> None:
     np.testing.assert_allclose(together[1, 1], alone[0], atol=1e-6)
 
 
-def test_lifting_is_the_static_upsampling() -> None:
+def test_lifting_is_by_the_map_of_the_model() -> None:
     surrogate = short()
     mu = plate.parameters(1, seed=5)[0]
-    up = plate.levels()[1].to_full.toarray()
+    up = surrogate.graphs.to_full(2).toarray()
     expected = np.einsum("fc,tcx->tfx", up, surrogate.predict(mu, level=2))
     np.testing.assert_allclose(surrogate.predict_full(mu, level=2), expected, atol=1e-6)
 
