@@ -170,7 +170,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     settings = all_settings(options.model, None, None, [options.set])
     bench = Bench(source_of(options.fine), source_of(options.coarse), options.test, settings, options.fresh)
     total = len(bench.coarse.campaign.parameters)
-    below = sorted({min(number or total, total) for number in below})
+    most = total - options.fresh  # the coarse runs of what is asked are kept away
+    below = sorted({min(number or most, most) for number in below})
     asked = f"{options.fresh} fresh training runs" if options.fresh else "test runs"
     found: dict[tuple[int, int | None], Cell] = {}
     for count in counts:
