@@ -83,15 +83,9 @@ def fit_coarse(
     keep = with_inputs(coarse, registration, notes)
     own, images = _coefficients(coarse, trials, registration, turn, settings, notes)
     parameters = coarse.campaign.parameters
-    sets, courses = [registration.read(parameters[keep])], [_registered(coarse, registration, own, keep)]
-    if images is not None:
-        beside = registration.read(registration.symmetry.images(parameters, registration.inputs.names)[keep])
-        if registration.symmetry.flagged:
-            beside[:, -1] = 1.0
-        sets.append(beside)
-        courses.append(_registered(coarse, registration, images, keep))
+    courses = [_registered(coarse, registration, some, keep) for some in (own, images) if some is not None]
     below = RunsBelow(
-        over_range(np.concatenate(sets), inputs), np.concatenate(courses), len(keep),
+        over_range(registration.read_with_images(parameters[keep]), inputs), np.concatenate(courses), len(keep),
         twins(trials.parameters, parameters[keep]),
     )  # fmt: skip
     fine = _Fine(trials, registration, plane, turn, inputs)

@@ -97,6 +97,16 @@ class Registration:
         """Inputs (run, input) of a model for parameters (run, parameter) of runs as computed."""
         return self._inputs(np.atleast_2d(parameters), len(np.atleast_2d(parameters)))
 
+    def read_with_images(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(run and image, input) for parameters (run, parameter): runs as computed, then their images in the same order."""
+        own = self.read(parameters)
+        if self.symmetry.is_identity:
+            return own
+        images = self.read(self.symmetry.images(parameters, self.inputs.names))
+        if self.symmetry.flagged:
+            images[:, -1] = 1.0
+        return np.concatenate([own, images])
+
     def on_grid(self, states: NDArray[Any], parameters: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[Any]:
         """States (state, ..) at `time` of a run with parameters (parameter,), registered, at the states of the grid.
 

@@ -283,14 +283,7 @@ class Trials:
 
     def inputs(self, registration: Registration) -> NDArray[np.float64]:
         """(run and image, input)"""
-        names = registration.inputs.names
-        own = registration.read(self.parameters)
-        if registration.symmetry.is_identity:
-            return own
-        images = registration.read(registration.symmetry.images(self.parameters, names))
-        if registration.symmetry.flagged:
-            images[:, -1] = 1.0
-        return np.concatenate([own, images])
+        return registration.read_with_images(self.parameters)
 
     def values(self, registration: Registration, plane: int) -> NDArray[np.float32]:
         """(run and image, state of the grid, mode); the last clock's are kept."""

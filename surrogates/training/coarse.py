@@ -31,8 +31,8 @@ def check_coarse_settings(settings: Settings) -> None:
         if settings.pod.inputs == "point":
             raise SurrogateError("coarse runs need one sample per run; leave out pod.inputs=point")
         return
-    wishes = {settings.for_level(k).regression for k in (*settings.levels, *settings.at)} or {settings.level.regression}
-    if wishes == {"network"}:
+    levels = [settings.for_level(k) for k in (*settings.at, *settings.levels, *(() if settings.levels else (-1,)))]
+    if all(level.regression == "network" for level in levels):
         raise SurrogateError(
             "coarse runs go beneath the processes of the levels, and level.regression=network has none; leave it out, or "
             "the preset paper"
@@ -42,7 +42,7 @@ def check_coarse_settings(settings: Settings) -> None:
         "validation.runs": bool(settings.validation.runs),
         "unified": settings.unified,
         "inputs.initial_state": settings.inputs.initial_state,
-        "level.regression=network": "network" in wishes,
+        "level.regression=network": any(v.regression == "network" and v.reduction != "pod" for v in levels),
     }
     found = next((name for name, there in against.items() if there), None)
     if found is not None:

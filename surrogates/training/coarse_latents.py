@@ -59,14 +59,7 @@ class CoarseFields:
     @property
     def inputs(self) -> NDArray[np.float64]:
         """(run and image, input)"""
-        parameters, of = self.coarse.campaign.parameters[self.keep], self.registration
-        own = of.read(parameters)
-        if of.symmetry.is_identity:
-            return own
-        images = of.read(of.symmetry.images(parameters, of.inputs.names))
-        if of.symmetry.flagged:
-            images[:, -1] = 1.0
-        return np.concatenate([own, images])
+        return self.registration.read_with_images(self.coarse.campaign.parameters[self.keep])
 
     def twin(self, parameters: NDArray[np.float64]) -> NDArray[np.int64]:
         """(run,) of fine runs (run, parameter): the coarse run of the same parameters; -1 without one."""
