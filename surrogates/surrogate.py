@@ -342,6 +342,8 @@ class Surrogate:
             return self.core.reconstruct(x, number)
         import torch
 
+        x = np.require(x, requirements="W")  # torch warns of arrays that may not be written to
+
         core = self.core
         with torch.no_grad():
             parts = [
@@ -357,6 +359,7 @@ class Surrogate:
             return self.core.encode(x)
         import torch
 
+        x = np.require(x, requirements="W")
         core = self.core
         with torch.no_grad():
             parts = [

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from crashkit.cli._console import print_json, say, table, what_next
+from crashkit.cli._console import print_json, say, share, table, what_next
 from crashkit.cli._progress import Progress
 
 
@@ -41,7 +41,9 @@ def command(
     distribution: Annotated[str, typer.Option(help="normal or uniform.")] = "normal",
     plan: Annotated[str, typer.Option(help="How draws are spread: latin (hypercube) or sobol.")] = "latin",
     level: Annotated[int | None, typer.Option(help="Predict from this mesh level.", show_default="the finest")] = None,
-    confidence: Annotated[float, typer.Option(help="Of the intervals of probabilities.", min=0.5, max=0.999)] = 0.9,
+    confidence: Annotated[
+        float, typer.Option(help="Of the intervals of probabilities: a share or 90%.", parser=share, metavar="SHARE")
+    ] = 0.9,
     seed: Annotated[int, typer.Option(help="The same seed gives the same draws.", min=0)] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier result.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,

@@ -83,6 +83,7 @@ def test_a_dataset_is_described_without_the_libraries_that_only_other_work_needs
         ("predict {data} -p impact_speed=20", "is a dataset; expected a model folder made by crashkit train"),
         ("predict there -p impact_speed=20 --band 90", "'90'; expected a share between 0 and 1, such as 0.9, or 90%"),
         ("optimise there --minimise impact_speed --confidence x", "'x'; expected a share between 0 and 1, such as 0.9"),
+        ("scatter there --confidence 95", "'95'; expected a share between 0 and 1, such as 0.9, or 95%"),
         ("campaign nope.yaml --confidence 95", "'95'; expected a share between 0 and 1, such as 0.9, or 95%"),
     ],
 )

@@ -181,6 +181,14 @@ def test_any_number_of_levels_and_states_can_be_asked_at_once() -> None:
     np.testing.assert_allclose(together[1, 1], alone[0], atol=1e-6)
 
 
+@pytest.mark.filterwarnings("error")
+def test_states_that_may_not_be_written_to_are_reduced_without_a_warning() -> None:
+    states = plate.displacement(plate.parameters(1))[0][:, plate.levels()[0].kept]
+    states.flags.writeable = False
+    np.testing.assert_array_equal(short().reconstruct(states), short().reconstruct(states.copy()))
+    np.testing.assert_array_equal(short().encode(states), short().encode(states.copy()))
+
+
 def test_lifting_is_by_the_map_of_the_model() -> None:
     surrogate = short()
     mu = plate.parameters(1, seed=5)[0]
