@@ -83,12 +83,17 @@ def file_name(name: str) -> str:
     return re.sub(r"[^\w.+=-]+", "-", unicodedata.normalize("NFC", name)).strip("-.") or "run"
 
 
-def check_model_folder(output: Path, overwrite: bool) -> None:
+def check_model_folder(output: Path, overwrite: bool, resume: bool = False) -> None:
     """Raise OutputError if a model cannot be stored as the folder `output`: better now than after the training."""
     if output.exists():
         if not output.is_dir() or (any(output.iterdir()) and not (output / "model.json").exists()):
             raise OutputError(f"{output}: exists and is no model folder; choose another place with -o")
         if not overwrite and any(output.iterdir()):
+            if resume:
+                raise OutputError(
+                    f"{output}: holds a finished training, so there is nothing to resume; to go on with further seeds of a "
+                    "series that was interrupted, give --overwrite beside --resume"
+                )
             raise OutputError(f"{output}: holds a model already; replace it with --overwrite, or choose another place")
     home = output.absolute().parent
     try:

@@ -95,7 +95,7 @@ class Surrogate:
         self.curves: dict[str, Curve] = {}
         self._upward: dict[int, sparse.csr_matrix] = {}
 
-    def with_graphs(self, graphs: Graphs) -> None:
+    def use_graphs(self, graphs: Graphs) -> None:
         """Take over other maps of the same levels to the full mesh."""
         self.graphs, self._upward = graphs, {}
 

@@ -135,7 +135,7 @@ def train(
     check_device_name(device)
     folder = None if output is None else Path(output)
     if folder is not None:
-        check_model_folder(folder, overwrite)
+        check_model_folder(folder, overwrite, resume)
     elif resume:
         raise SurrogateError("resume goes on with a training beside its model folder; give output")
     if coarse is not None:

@@ -53,7 +53,8 @@ _TEXT = (
     "The mean node error e2 is the Euclidean distance between the node of the solver's run and the predicted node, "
     "averaged over nodes, then over time, then over the test runs, each run and each state counting the same. It is "
     "an error of displacements, in centimetres, on the full mesh: predictions on a coarse mesh are lifted to it with "
-    "the static barycentric upsampling, the same for every model. Nodes without a living element are left out.",
+    "the map of their model, which is barycentric, or learnt from its training runs where that is better (its card says "
+    "which). Nodes without a living element are left out.",
     "The relative error is the L2 norm of the displacement error over all nodes and states of a run, divided by "
     "that of "
     "the displacement, and averaged over the runs; it does not depend on where the origin lies. "

@@ -84,7 +84,7 @@ def card(surrogate: Surrogate) -> str:
         lines += ["## Notes", "", *(f"- {_plain(note)}" for note in record.notes), ""]
     if record.choice:
         how = "by cross-validation" if by_folds else "on validation runs"
-        lines += [f"Chosen {how}: {', '.join(f'{k} {v}' for k, v in record.choice.items())}.", ""]
+        lines += [f"Chosen {how}:", "", *(f"- {k}: {v}" for k, v in record.choice.items()), ""]
     lines += [
         "## Settings",
         "",

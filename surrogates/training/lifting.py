@@ -77,8 +77,10 @@ class Lifts:
         if number not in self.errors:
             return ""
         static, learnt = (100 * e for e in self.errors[number])
-        kept = "learnt" if number in self.maps else "static"
-        return f"{kept} map to the full mesh (RMS on runs left out: static {static:.3f} cm, learnt {learnt:.3f} cm)"
+        kept = "learnt" if number in self.maps else "barycentric"
+        return (
+            f"{kept} map to the full mesh (RMS on runs left out: barycentric {static:.3f} cm, learnt {learnt:.3f} cm)"
+        )
 
 
 def learn_lifts(

@@ -428,7 +428,7 @@ def _learnt_lifts(surrogate: Surrogate, trainer: Trainer) -> Lifts | None:
         part[training] = np.random.default_rng(settings.seed).permutation(len(training)) % settings.validation.folds
     numbers = list(surrogate.level_names.values())
     lifts = learn_lifts(full, surrogate.graphs, numbers, part, training, campaign.points, campaign.known)
-    surrogate.with_graphs(lifts.put_on(surrogate.graphs))
+    surrogate.use_graphs(lifts.put_on(surrogate.graphs))
     if not isinstance(trainer, FoldTrainer):
         # Runs that are judged were not learnt from.
         return replace(lifts, part=np.full(runs, -1))

@@ -69,6 +69,7 @@ def test_a_dataset_is_described_without_the_libraries_that_only_other_work_needs
         ("train {data} -o m --model podnn --coarse {data}", "coarse runs go beneath mh and pod-gpr"),
         ("train {data} -o m --preset paper --coarse {data}", "level.regression=network has none"),
         ("train {data} -o there", "there: exists and is no model folder"),
+        ("train {data} -o done --resume", "done: holds a finished training, so there is nothing to resume"),
         ("train {data} -o m --device gpu", "device 'gpu' is not known"),
         ("train {data} -o m --model pod-gpr --test 99:", "'99:' does not fit 36 runs"),
         ("train {data} -o m --model pod-gpr --odd yield_stress", "physics.odd names yield_stress, which is 1"),
@@ -92,6 +93,8 @@ def test_what_can_be_refused_at_once_is_refused_before_torch_is_imported(
 ) -> None:
     (tmp_path / "there").mkdir()
     (tmp_path / "there" / "file.html").write_text("mine")
+    (tmp_path / "done").mkdir()
+    (tmp_path / "done" / "model.json").write_text("{}")
     line = ["crashkit", *(word.format(data=demo_dataset) for word in arguments.split())]
     code = f"""
 import os, sys, crashkit.cli as c

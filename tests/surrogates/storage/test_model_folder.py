@@ -64,7 +64,7 @@ def test_history_ranges_and_card_come_back(folder: Path, surrogate: Surrogate) -
 def test_the_card_says_which_runs_its_errors_are_of(folder: Path) -> None:
     by_folds = (folder / "card.md").read_text()
     assert "## Errors in cross-validation" in by_folds
-    assert "Chosen by cross-validation: MH2 " in by_folds
+    assert "Chosen by cross-validation:\n\n- MH2: " in by_folds
     assert "validation runs chose" not in by_folds.lower()
     held = train_surrogate(
         plate.campaign(8), settings("mh", overrides=["level.epochs=1", "level.regression=network", "levels=[2]"])
