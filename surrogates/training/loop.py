@@ -384,7 +384,8 @@ def _kind_of_step(
     if torch.distributed.is_initialized():
         return _Step
     if captured is None:
-        captured = device.type == "cuda" and objective.in_place
+        # AdamW was tried on a device; Adam goes the same way.
+        captured = device.type == "cuda" and objective.in_place and settings.optimiser != "sgd"
     if captured:
         return CapturedStep
     # A limit on the gradient's norm needs all of it.

@@ -704,12 +704,14 @@ def test_the_step_that_is_captured_on_a_gpu_goes_the_same_way_on_the_cpu() -> No
 
 
 def test_steps_are_captured_where_all_they_read_lies_on_a_cuda_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    def kind(device: str, captured: bool | None = None) -> type:
-        return loop._kind_of_step(Line(), SETTINGS, "float32", captured, torch.device(device))
+    def kind(device: str, captured: bool | None = None, **changes: object) -> type:
+        own = SETTINGS.model_copy(update=changes)
+        return loop._kind_of_step(Line(), own, "float32", captured, torch.device(device))
 
     monkeypatch.setattr(Line, "in_place", True)
     assert kind("cuda") is loop.CapturedStep
     assert kind("cuda", False) is kind("cpu") is loop._Step
+    assert kind("cuda", optimiser="sgd") is loop._Step
     monkeypatch.setattr(Line, "in_place", False)
     assert kind("cuda") is loop._Step
 
