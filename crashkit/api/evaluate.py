@@ -139,8 +139,9 @@ def evaluate(
     reference, stored = _opened(source, asked)
     split = agree_on_split(reference, stored, _test_names(source, reference, stored, test))
     if not split.train:
+        none = "test runs alone" if len(split.test) == len(reference.runs) else "none of the runs the models have seen"
         raise EvaluationError(
-            f"{source.name}: holds test runs alone; give the training runs, too, by which the data is described"
+            f"{source.name}: holds {none}; give the training runs, too, by which the data is described"
         )
     entries(stored, seeds_as_spread)  # refuses what cannot be compared before anything is computed
     shown_runs = None if vtk_runs is None else _places(reference, vtk_runs)
@@ -585,12 +586,13 @@ def _context(dataset: Path, reference: Reference, models: Sequence[ComparedModel
         with contextlib.suppress(PackageNotFoundError):
             packages.append(f"{name} {version(name)}")
     names = [reference.runs[k] for k in split.test]
+    unused = len(reference.runs) - len(split.train) - len(split.test)
     attributes = reference.attributes
     return {
         "Dataset": dataset.name,
         "Checksum (SHA-256)": reference.checksum or "not recorded",
         "Solver": attributes.get("solver", "not recorded"),
-        "Runs": f"{len(reference.runs)}, of which {len(names)} test",
+        "Runs": f"{len(reference.runs)}, of which {len(names)} test" + (f" and {unused} not used" if unused else ""),
         "Test runs": ", ".join(names),
         "Parameters": ", ".join(
             f"{n} ({u})" for n, u in zip(reference.parameter_names, reference.parameter_units, strict=True)

@@ -39,14 +39,17 @@ class Entry:
 
 @dataclass(frozen=True)
 class Split:
-    """Run numbers: `test` for the comparison, `train` for what describes the data (modes, coverage)."""
+    """Run numbers: `test` for the comparison, `train` for what the models know (modes, ranges); the others are not used."""
 
     train: tuple[int, ...]
     test: tuple[int, ...]
 
 
 def agree_on_split(reference: Reference, models: Sequence[ComparedModel], test: Sequence[str] | None = None) -> Split:
-    """The test runs: those asked for, else those that all models hold out.
+    """The test runs: those asked for, else those that all models hold out; and the training runs.
+
+    Training runs are those of the dataset that a model was fitted or tuned on; where one does not say, all that are no
+    test runs. A run that no model has seen tells nothing of where they extrapolate.
 
     Raises
     ------
@@ -77,7 +80,9 @@ def agree_on_split(reference: Reference, models: Sequence[ComparedModel], test: 
                     f"error on them says nothing: choose other test runs, or train it again with these held out"
                 )
     taken = set(numbers)
-    return Split(tuple(k for k in range(len(reference.runs)) if k not in taken), numbers)
+    seen_by = [{*model.fitted_runs, *model.tuned_runs} for model in models]
+    known = set().union(*seen_by) if all(seen_by) else set(reference.runs)
+    return Split(tuple(k for k, run in enumerate(reference.runs) if k not in taken and run in known), numbers)
 
 
 def _held_out(models: Sequence[ComparedModel]) -> tuple[str, ...]:

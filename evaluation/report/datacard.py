@@ -138,7 +138,7 @@ def card_drawings(reference: Reference, summary: Summary) -> list[tuple[Kind, Dr
                 "How the runs cover the design space",
                 Coverage(
                     reference.parameter_names, reference.parameter_units, reference.runs, reference.parameters,
-                    np.zeros(len(reference.runs), bool),
+                    *np.zeros((2, len(reference.runs)), bool),
                 ),
             )
         )  # fmt: skip

@@ -61,6 +61,9 @@ def test_a_selection_of_runs_trains_and_is_evaluated(runs: xr.Dataset, data: Pat
     np.testing.assert_array_equal(result.scores["PODNN"].e2, by_path.scores["PODNN"].e2)
     with pytest.raises(crashkit.EvaluationError, match="holds test runs alone; give the training runs, too"):
         crashkit.evaluate(runs.isel(sim=slice(6, 8)), podnn)
+    few = crashkit.train(runs.isel(sim=slice(5)), model="podnn", settings=FEW, device="cpu")
+    with pytest.raises(crashkit.EvaluationError, match="holds none of the runs the models have seen"):
+        crashkit.evaluate(runs.isel(sim=slice(5, 8)), few, test="1:3")
 
 
 def test_several_models_in_hand_or_stored_are_compared(runs: xr.Dataset, model: crashkit.Model, tmp_path: Path) -> None:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from evaluation.comparison.result import compare
 from evaluation.comparison.split import agree_on_split, entries
 from evaluation.errors import EvaluationError
+from evaluation.figures.coverage import select
 
 
 def test_the_runs_all_models_hold_out_are_the_test_runs(reference, models):
@@ -18,6 +21,28 @@ def test_the_runs_all_models_hold_out_are_the_test_runs(reference, models):
 
 def test_test_runs_may_be_named(reference, models):
     assert agree_on_split(reference, models, ["run_11", "run_09"]).test == (11, 9)
+
+
+def test_training_runs_are_those_that_a_model_has_seen(reference, models):
+    small = replace(models[0], fitted_runs=("run_02", "run_04"), tuned_runs=("run_05",))
+    smaller = replace(models[1], fitted_runs=("run_02", "run_06"), tuned_runs=())
+    assert agree_on_split(reference, (small, smaller)).train == (2, 4, 5, 6)
+
+
+def test_a_model_that_does_not_say_may_have_seen_all_but_the_test_runs(reference, models):
+    silent = replace(models[1], fitted_runs=(), tuned_runs=())
+    assert agree_on_split(reference, (silent, replace(models[0], fitted_runs=("run_02",)))).train == tuple(range(9))
+
+
+def test_a_test_run_is_outside_where_only_runs_that_no_model_saw_reach_further(reference, models):
+    order = np.argsort(reference.parameters[:, 0])
+    tested, beyond = reference.runs[order[-2]], reference.runs[order[-1]]
+    seen = tuple(reference.runs[k] for k in order[:-2])
+    model = replace(models[2], fitted_runs=seen, tuned_runs=(), held_out_runs=(tested, beyond))
+    split = agree_on_split(reference, (model,), [tested])
+    figure = select(compare(reference, (model,), split, timed=False))
+    assert dict(zip(figure.runs, figure.numbers()["role"], strict=True))[beyond] == "not used"
+    assert "1 test runs lie outside the range of the training runs" in figure.caption()
 
 
 def test_a_model_trained_on_a_test_run_is_refused_by_name(reference, models):
