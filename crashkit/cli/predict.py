@@ -137,13 +137,13 @@ def command(
     for row in rows:
         for sentence in row.warnings:
             say(f"warning: {row.run + ': ' if row.run else ''}{sentence}")
-    show(rows)
+    show(rows, from_coarse=bool(coarse_run))
 
 
-def show(rows: list[PredictedRun]) -> None:
+def show(rows: list[PredictedRun], *, from_coarse: bool = False) -> None:
     """What was predicted, its error where the truth is known, and the file to open."""
     first = rows[0]
-    where = f"{first.model}, {first.states} states of {first.nodes} nodes"
+    where = f"{first.model}{' from a coarse run' * from_coarse}, {first.states} states of {first.nodes} nodes"
     if len(rows) > 1:
         table(
             f"{len(rows)} runs predicted: {where}",

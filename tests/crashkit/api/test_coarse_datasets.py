@@ -170,6 +170,7 @@ def test_the_commands(coarse: xr.Dataset, tmp_path: Path) -> None:
         ["predict", str(tmp_path / "m"), "--coarse-run", f"{tmp_path / 'elsewhere.zarr'}:run_20", "-o", str(tmp_path / "p.npz")],
     )  # fmt: skip
     assert said.exit_code == 0, said.output
+    assert "POD-GPR from a coarse run, " in " ".join(said.output.split())
     true = dataset(9, range(20, 21))["displacement"].values[0]
     found = np.load(tmp_path / "p.npz")["displacement"]
     assert np.linalg.norm(found - true, axis=-1).mean() < 0.1 * np.linalg.norm(true, axis=-1).mean()
