@@ -26,6 +26,26 @@ _SAME_PLACE = 1e-4
 # Two parameters are the same within this share of the range.
 _SAME = 1e-6
 _SUFFIXES = (".zarr", ".nc")
+# A smaller share of the fine runs within the coarse ones' range of a parameter is told.
+_WITHIN_RANGE = 0.1
+
+
+def check_count(given: str | Path | xr.Dataset) -> None:
+    """Raise DataError where the dataset `given` has too few runs to help, before anything is searched."""
+    from crashkit.api.source import source_of
+
+    source = source_of(given)
+    with source.opened() as dataset:
+        _enough(source.name, int(dataset.sizes["sim"]))
+
+
+def _enough(name: str, count: int, of: str = "") -> None:
+    from crashkit.errors import DataError
+    from surrogates.data.campaign import FEWEST_COARSE
+
+    if count < FEWEST_COARSE:
+        runs = "run" if count == 1 else "runs"
+        raise DataError(f"{name}: has {count} coarse {runs}{of}; expected at least {FEWEST_COARSE}")
 
 
 def coarse_runs(given: str | Path | xr.Dataset, campaign: Campaign, source: Source) -> CoarseRuns:
@@ -42,8 +62,8 @@ def coarse_runs(given: str | Path | xr.Dataset, campaign: Campaign, source: Sour
     Raises
     ------
     ReadError, DataError
-        For parts, parameters and units that do not match, for meshes that are not those of one structure, and for
-        coarse runs that end earlier.
+        For parts, parameters and units that do not match, for parameters in another range altogether, for meshes that
+        are not those of one structure, and for coarse runs that end earlier or are too few.
     """
     import numpy as np
 
@@ -58,6 +78,8 @@ def coarse_runs(given: str | Path | xr.Dataset, campaign: Campaign, source: Sour
     if found.checksum and found.checksum == campaign.checksum:
         raise DataError(f"{below.name}: is {source.name} itself; expected further runs, on a coarser mesh")
     order = _order(found, campaign, below.name)
+    parameters = found.parameters[:, order]
+    notes = _ranges(parameters, campaign, below.name)
     matched = _parts(found, campaign, below.name)
     points, faces, labels = _mesh(found)
     fine_points, fine_faces, fine_labels = _mesh(campaign)
@@ -74,13 +96,13 @@ def coarse_runs(given: str | Path | xr.Dataset, campaign: Campaign, source: Sour
         raise DataError(
             f"{below.name}: its runs end at {found.time[-1]:g} s, those of {source.name} at {end:g} s; compute coarse runs as long"
         )
-    parameters = found.parameters[:, order]
     tested = _tested(source, campaign)
     span = np.maximum(np.ptp(parameters, axis=0), 1e-300)
     own = (np.abs((parameters[:, None] - tested[None]) / span) <= _SAME).all(axis=2).any(axis=1)
     keep = np.flatnonzero(~own)
     if not len(keep):
         raise DataError(f"{below.name}: has the parameters of the test runs alone; expected further coarse runs")
+    _enough(below.name, len(keep), " without those of the test runs" if own.any() else "")
     field = found.displacement(0)
     about = {**(found.attributes or {}), "units_read": _units(below), "of_test_runs": str(int(own.sum()))}
     runs = replace(
@@ -96,7 +118,7 @@ def coarse_runs(given: str | Path | xr.Dataset, campaign: Campaign, source: Sour
         targets=(),
         curves=(),
     )
-    return CoarseRuns(runs, to_fine)
+    return CoarseRuns(runs, to_fine, notes)
 
 
 def coarse_run_states(
@@ -194,6 +216,39 @@ def _order(found: Campaign, campaign: Campaign, name: str) -> list[int]:
                 f"{unit or 'no unit'}; ingest both with units"
             )
     return order
+
+
+def _ranges(parameters: NDArray[np.float64], campaign: Campaign, name: str) -> tuple[str, ...]:
+    """A line for each parameter (of the coarse runs `parameters`, (run, parameter)) in whose range few fine runs lie.
+
+    Where the structure has mirror planes, a run counts with its mirrored value, too: its image may be the one that helps.
+
+    Raises
+    ------
+    DataError
+        With such a line, where the ranges of coarse and fine runs do not overlap.
+    """
+    import numpy as np
+
+    from crashkit.errors import DataError
+
+    lines = []
+    units = campaign.table_units or [(unit, 1.0) for unit in campaign.parameter_units]
+    for k, (parameter, (unit, factor)) in enumerate(zip(campaign.parameter_names, units, strict=True)):
+        fine, coarse = campaign.parameters[:, k], parameters[:, k]
+        if not (np.isfinite(fine).all() and np.isfinite(coarse).all()):
+            continue  # told where values are checked
+        low, high = float(coarse.min()), float(coarse.max())
+        slack = _SAME * max(high - low, abs(low), abs(high))
+        limits = [(low - slack, high + slack), *([(-high - slack, -low + slack)] if campaign.mirrors else [])]
+        if any(np.mean((a <= fine) & (fine <= b)) >= _WITHIN_RANGE for a, b in limits):
+            continue
+        told = [f"{some.min() / factor:.4g} to {some.max() / factor:.4g} {unit}".strip() for some in (coarse, fine)]
+        line = f"{name}: {parameter} is {told[0]} in the coarse runs and {told[1]} in the fine ones; check the value and its unit"
+        if not any(fine.min() <= b and a <= fine.max() for a, b in limits):
+            raise DataError(line)
+        lines.append(line)
+    return tuple(lines)
 
 
 def _parts(found: Campaign, campaign: Campaign, name: str) -> NDArray[np.int64]:

@@ -148,11 +148,13 @@ def train(
     symmetry = chosen.model in ("mh", "podnn", "pod-gpr", "pod-rbf") and chosen.physics.symmetry == "auto"
     odd = chosen.physics.odd or ()
     source = source_of(dataset, hierarchy)
+    if coarse is not None:
+        from crashkit.api.coarse_runs import check_count, coarse_runs
+
+        check_count(coarse)
     campaign = open_campaign(source, test, symmetry=symmetry, odd=odd)
     give_back()  # the search for mirror planes leaves much free between what stays
     if coarse is not None:
-        from crashkit.api.coarse_runs import coarse_runs
-
         campaign = replace(campaign, coarse=coarse_runs(coarse, campaign, source))
     # From here on torch is needed: what can be refused without it was.
     from crashkit.api.model import Model

@@ -13,6 +13,9 @@ from scipy import sparse
 from data_schema.levels import Level
 from data_schema.mirror import MirrorPlane
 
+# Coarse runs without which there is no process of them.
+FEWEST_COARSE = 4
+
 
 class RunByRun(Protocol):
     """Displacements (sim, state, node, 3) float32, m, of which one run at a time is taken; a numpy array is one."""
@@ -160,7 +163,10 @@ class CoarseRuns:
         The runs: parameters in the order and units of those of the finer mesh, displacements on their own full mesh.
     to_fine
         (node of the finer mesh, node of the coarser one): what a field says at each node, part by part.
+    notes
+        What is odd about them, a sentence each.
     """
 
     campaign: Campaign
     to_fine: sparse.csr_matrix
+    notes: tuple[str, ...] = ()

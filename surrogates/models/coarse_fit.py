@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogates.data.campaign import CoarseRuns
+from surrogates.data.campaign import FEWEST_COARSE, CoarseRuns
 from surrogates.data.inputs import over_range
 from surrogates.data.samples import LevelRuns, Notes
 from surrogates.errors import SurrogateError
@@ -25,9 +25,6 @@ from surrogates.regression.gaussian import Gaussian
 from surrogates.settings import Settings
 
 _log = logging.getLogger(__name__)
-
-# Fewer coarse runs give no process.
-FEWEST_COARSE = 4
 
 
 @dataclass
@@ -116,7 +113,9 @@ def with_inputs(coarse: CoarseRuns, registration: Registration, notes: Notes) ->
     if len(keep) < len(inputs):
         notes.add(f"{len(inputs) - len(keep)} coarse runs are left out: their parameters have no derived inputs")
     if len(keep) < FEWEST_COARSE:
-        raise SurrogateError(f"there are {len(keep)} coarse runs; expected at least {FEWEST_COARSE}")
+        raise SurrogateError(
+            f"{len(keep)} of {len(inputs)} coarse runs have derived inputs; expected at least {FEWEST_COARSE}"
+        )
     return keep
 
 

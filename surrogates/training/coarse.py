@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from surrogates.data.campaign import Campaign, CoarseRuns
-from surrogates.data.samples import FEWEST_TO_SPLIT
+from surrogates.data.samples import FEWEST_TO_SPLIT, Notes
 from surrogates.errors import SurrogateError
 from surrogates.models.coarse_fit import CoarseFit
 from surrogates.record import Record
@@ -51,10 +51,12 @@ def check_coarse_settings(settings: Settings) -> None:
         )
 
 
-def check_coarse(campaign: Campaign, settings: Settings) -> None:
-    """Raise SurrogateError where coarse runs are given to a training that does not take them."""
+def check_coarse(campaign: Campaign, settings: Settings, notes: Notes) -> None:
+    """Raise SurrogateError where coarse runs are given to a training that does not take them; note what is odd about them."""
     if campaign.coarse is None:
         return
+    for line in campaign.coarse.notes:
+        notes.add(line)
     check_coarse_settings(settings)
     runs = len(campaign.parameters)
     if settings.model == "mh" and runs < FEWEST_TO_SPLIT:

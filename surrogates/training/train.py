@@ -102,7 +102,7 @@ def train_surrogate(
     notes = Notes()
     check(campaign, settings, notes)
     check_targets(campaign, settings)
-    check_coarse(campaign, settings)
+    check_coarse(campaign, settings, notes)
     of_pod = settings.model in ("pod-gpr", "pod-rbf")
     by_folds = of_pod or chooses_by_folds(settings, campaign)
     parts = everything(campaign, settings) if by_folds else split(campaign, settings, notes)

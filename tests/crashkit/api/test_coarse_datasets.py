@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,15 @@ import xarray as xr
 from typer.testing import CliRunner
 
 import crashkit
+from crashkit.api.coarse_runs import _ranges
 from crashkit.api.model import Model
 from crashkit.api.predict_runs import predict_runs
 from crashkit.api.run_study import study_steps
 from crashkit.cli import app
 from crashkit.errors import CrashkitError, DataError
 from crashkit.writers.d3plot import write_d3plot
+from data_schema.mirror import MirrorPlane
+from surrogates.data.campaign import Campaign
 from surrogates.errors import SurrogateError
 
 TIME = np.linspace(0.0, 0.02, 6)
@@ -93,6 +97,54 @@ def test_what_does_not_match_is_refused_in_one_line(changes: dict[str, object], 
     with pytest.raises(DataError, match=said) as refused:
         trained_with(dataset(5, range(9), **changes))
     assert "\n" not in str(refused.value)
+
+
+def faster(coarse: xr.Dataset, times: float) -> xr.Dataset:
+    """Speeds of 8 to 16 m/s as so many times as much, still in m/s."""
+    return coarse.assign(speed=coarse["speed"] * times)
+
+
+def test_coarse_runs_at_other_values_altogether_are_refused_with_both_ranges(coarse: xr.Dataset) -> None:
+    said = r": speed is 29\.94 to \S+ m/s in the coarse runs and \S+ to 1\d\.\d+ m/s in the fine ones; check the value and its unit"
+    with pytest.raises(DataError, match=said):
+        trained_with(faster(coarse, 3.6))
+
+
+def test_coarse_runs_whose_range_holds_hardly_a_fine_run_are_noted(coarse: xr.Dataset) -> None:
+    table = dataset(9, range(12))["speed"].values
+    rows = np.flatnonzero(coarse["speed"].values >= table.max())
+    fast = faster(coarse, 1.0).isel(sim=rows)
+    noted = crashkit.train(dataset(9, range(12)), model="pod-gpr", settings=OFF, coarse=fast)
+    (line,) = [n for n in noted.record.notes if "check the value and its unit" in n]
+    assert "speed is" in line
+    assert "\n" not in line
+
+
+def test_coarse_runs_that_hold_the_fine_ones_are_not_noted(model: Model) -> None:
+    assert not [n for n in model.record.notes if "check the value and its unit" in n]
+
+
+def test_a_mirrored_range_is_enough_where_the_structure_has_a_mirror_plane() -> None:
+    plane = MirrorPlane.__new__(MirrorPlane)
+    fine = Campaign(
+        np.array([[-2.0], [-1.0]]), ("offset",), ("m",), TIME, lambda level: np.zeros(0), 0, mirrors=(plane,)
+    )
+    assert _ranges(np.array([[1.0], [2.0]]), fine, "coarse.zarr") == ()
+    with pytest.raises(DataError, match="offset is 1 to 2 m in the coarse runs and -2 to -1 m in the fine ones"):
+        _ranges(np.array([[1.0], [2.0]]), replace(fine, mirrors=()), "coarse.zarr")
+
+
+def test_too_few_coarse_runs_are_refused_by_name_before_the_fine_ones_are_read(tmp_path: Path) -> None:
+    dataset(5, range(2), output=tmp_path / "two.zarr")
+    with pytest.raises(DataError, match=r"two\.zarr: has 2 coarse runs; expected at least 4"):
+        crashkit.train(
+            dataset(9, range(6)), model="pod-gpr", settings=OFF, test="never:read", coarse=tmp_path / "two.zarr"
+        )
+
+
+def test_coarse_runs_that_are_too_few_without_those_of_test_runs_are_refused() -> None:
+    with pytest.raises(DataError, match="has 2 coarse runs without those of the test runs; expected at least 4"):
+        crashkit.train(dataset(9, range(6)), model="pod-gpr", settings=OFF, test="2:", coarse=dataset(5, range(6)))
 
 
 def test_the_fine_runs_themselves_are_no_coarse_runs() -> None:
