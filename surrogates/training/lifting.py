@@ -50,7 +50,7 @@ class Lifts:
     errors
         Of every level that was tried: RMS distance, m, over runs left out, of the static map and of the learnt one.
     part
-        (run,) the fold that leaves a run out; -1: none.
+        (run,) the fold that leaves a run out; -1: none, as for runs that nothing was learnt from.
     """
 
     maps: dict[int, sparse.csr_matrix]
@@ -111,7 +111,7 @@ def learn_lifts(
         return Lifts({}, {}, {}, part)
     _log.info("maps from the levels to the full mesh")
     searches = {k: _Search(graphs, k, points) for k in tried}
-    rest = training[part[training] < 0]
+    rest = training[part[training] < 0]  # never left out: behind the folds, and in every map
     for runs in [*folds, rest]:
         for search in searches.values():
             search.begin()

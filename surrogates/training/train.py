@@ -7,7 +7,6 @@ import itertools
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
 from fnmatch import fnmatchcase
 
 import numpy as np
@@ -420,18 +419,14 @@ def _learnt_lifts(surrogate: Surrogate, trainer: Trainer) -> Lifts | None:
     if settings.transfer.lifting == "static" or settings.refinement.adaptive or campaign.points is None or full is None:
         return None
     runs = len(campaign.parameters)
-    training = np.arange(runs) if isinstance(trainer, FoldTrainer) else trainer.split.training
-    part = np.full(runs, -1)
     if isinstance(trainer, FoldTrainer):
-        part = trainer.part[:runs]
-    else:
+        training, part = np.arange(runs), trainer.part[:runs]
+    else:  # validation runs are in no fold, since none learns from them
+        training, part = trainer.split.training, np.full(runs, -1)
         part[training] = np.random.default_rng(settings.seed).permutation(len(training)) % settings.validation.folds
     numbers = list(surrogate.level_names.values())
     lifts = learn_lifts(full, surrogate.graphs, numbers, part, training, campaign.points, campaign.known)
     surrogate.use_graphs(lifts.put_on(surrogate.graphs))
-    if not isinstance(trainer, FoldTrainer):
-        # Runs that are judged were not learnt from.
-        return replace(lifts, part=np.full(runs, -1))
     return lifts
 
 

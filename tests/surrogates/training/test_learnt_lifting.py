@@ -124,3 +124,13 @@ def test_the_static_map_stays_where_it_is_asked_for(changes: dict[str, object]) 
     model = train_surrogate(plate.campaign(RUNS), settings("mh", overrides={**QUICK, **changes}))
     assert abs(model.graphs.to_full(1) - plate.levels()[0].to_full).max() == 0
     assert not any("map to the full mesh" in str(told) for told in model.record.choice.values())
+
+
+def test_a_network_judged_on_validation_runs_has_learnt_from_the_others() -> None:
+    own = settings("mh", overrides={"level": {"epochs": 1, "regression": "network"}, "transfer": {"epochs": 1.0}})
+    model = train_surrogate(plate.campaign(RUNS), own)
+    assert set(model.record.choice) == {"MH1", "MH2"}  # nothing but the maps is chosen
+    field = dent()
+    held = [int(name.removeprefix("run_")) for name in model.record.validation_runs]
+    assert held
+    assert missed(model.graphs.to_full(1), 1, field[held]) < missed(plate.levels()[0].to_full, 1, field[held])
