@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy import sparse
 
 from evaluation.comparison.reference import Reference
 from evaluation.comparison.result import compare, decompose, predictors_of
@@ -78,6 +80,28 @@ def test_the_cost_of_lifting_is_that_of_the_truth(reference, evaluation):
         errors.append(np.linalg.norm(u - lifted, axis=-1).mean())
     assert evaluation.lifting(1) == pytest.approx(np.mean(errors), rel=1e-4)
     assert evaluation.lifting(0) == 0
+    for entry in evaluation.entries:
+        assert evaluation.lifting_of(entry) == evaluation.lifting(entry.level)
+
+
+def test_a_model_with_a_map_of_its_own_is_measured_with_it(reference, models):
+    level = reference.level(3)
+    heaviest = np.asarray(level.to_full.argmax(axis=1)).ravel()
+    nearest = sparse.csr_matrix((np.ones(len(heaviest)), (np.arange(len(heaviest)), heaviest)), level.to_full.shape)
+    mine = copy.copy(models[0].predictors[2])
+    mine.mesh = replace(level, to_full=nearest)
+    model = replace(models[0], predictors=(mine,))
+    evaluation = compare(reference, [model], Split(tuple(range(9)), (10,)))
+    truth = reference.displacement(10)
+    said = mine.predict(reference.parameters[10], reference.time)
+    (entry,) = evaluation.entries
+
+    def off(states: np.ndarray) -> float:
+        return float(np.linalg.norm(truth - states[:, heaviest], axis=-1).mean())
+
+    assert evaluation.lifting_of(entry) == pytest.approx(off(truth[:, level.kept]), rel=1e-4)
+    assert evaluation.scores[entry.label].mean == pytest.approx(off(said), rel=1e-4)
+    assert evaluation.lifting(3) < evaluation.lifting_of(entry)
 
 
 def test_the_mean_error_of_a_node_is_over_runs_and_states(reference, models, evaluation):
